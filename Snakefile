@@ -1,0 +1,44 @@
+# snakesfm: a folder of photographs becomes a COLMAP model by global Structure-from-Motion.
+#
+#   snakemake --profile profiles/local --config images=PATH output=DIR
+
+from snakemake.utils import min_version
+
+min_version("9.27")
+
+
+configfile: workflow.basedir + "/config.yaml"
+
+
+report: "workflow/report/workflow.rst"
+
+
+include: "workflow/rules/common.smk"
+include: "workflow/rules/ingest.smk"
+include: "workflow/rules/features.smk"
+include: "workflow/rules/matching.smk"
+include: "workflow/rules/mapping.smk"
+include: "workflow/rules/export.smk"
+include: "workflow/rules/reporting.smk"
+
+
+localrules:
+    all,
+
+
+rule all:
+    default_target: True
+    input:
+        final_files(),
+
+
+onstart:
+    start_run()
+
+
+onsuccess:
+    finish_run(log)
+
+
+onerror:
+    fail_run(log)

@@ -1,0 +1,53 @@
+"""The files between the stages: one dataclass per kind, with its reader and writer."""
+
+from snakesfm.artifacts.base import Artifact, Header, atomic_path, read_header, write_json
+from snakesfm.artifacts.features import GlobalDescriptors, LocalFeatures, Vocabulary
+from snakesfm.artifacts.images import CalibratedCameras, ImageIndex
+from snakesfm.artifacts.mapping import (
+    CameraCenters,
+    CameraRotations,
+    Reconstruction,
+    TrackTable,
+    TriangulatedPoints,
+)
+from snakesfm.artifacts.pairs import ImagePairs, PairMatches, TwoViewGeometries, ViewGraph
+
+ARTIFACTS: tuple[type[Artifact], ...] = (
+    ImageIndex,
+    LocalFeatures,
+    Vocabulary,
+    GlobalDescriptors,
+    ImagePairs,
+    PairMatches,
+    CalibratedCameras,
+    TwoViewGeometries,
+    ViewGraph,
+    CameraRotations,
+    TrackTable,
+    CameraCenters,
+    TriangulatedPoints,
+    Reconstruction,
+)
+
+__all__ = [
+    "ARTIFACTS",
+    "Artifact",
+    "CalibratedCameras",
+    "CameraCenters",
+    "CameraRotations",
+    "GlobalDescriptors",
+    "Header",
+    "ImageIndex",
+    "ImagePairs",
+    "LocalFeatures",
+    "PairMatches",
+    "Reconstruction",
+    "TrackTable",
+    "TriangulatedPoints",
+    "TwoViewGeometries",
+    "ViewGraph",
+    "Vocabulary",
+    "atomic_path",
+    "read_header",
+    "write_json",
+]

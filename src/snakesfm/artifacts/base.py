@@ -1,0 +1,207 @@
+"""How every artifact is declared, written, read and checked.
+
+An artifact is a frozen dataclass whose fields are declared with :func:`column`. One HDF5 file holds
+one artifact: a dataset per column, and root attributes that say what it is. A file is written to a
+temporary name in the same folder and renamed, so a file that is there is complete.
+"""
+
+import dataclasses
+import json
+import os
+import tempfile
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar, Self
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+import snakesfm
+from snakesfm.errors import ArtifactError
+
+Array = NDArray[Any]
+STRING = h5py.string_dtype("utf-8")
+
+
+@dataclass(frozen=True)
+class Header:
+    """Where an artifact comes from; the root attributes of its file."""
+
+    stage: str
+    stage_version: int
+    scene: str
+    options: str = "{}"
+
+
+def column(shape: str, dtype: str, description: str) -> Any:
+    """Declare a column.
+
+    Parameters
+    ----------
+    shape : symbolic shape such as ``"(P,2)"``; a letter must have one length in the whole artifact and
+        ``P+1`` is one more than ``P``.
+    dtype : numpy dtype name, or ``"str"``.
+    description : one sentence with unit and frame, for docs/artifacts.md.
+    """
+    return dataclasses.field(metadata={"shape": shape, "dtype": dtype, "description": description})
+
+
+def _dimensions(shape: str) -> list[str]:
+    return [part.strip() for part in shape.strip("()").split(",") if part.strip()]
+
+
+@dataclass(frozen=True)
+class Artifact:
+    """Base of all artifacts: write, read, and checks of dtype and shape."""
+
+    kind: ClassVar[str] = ""
+    format_version: ClassVar[int] = 1
+
+    def __post_init__(self) -> None:
+        lengths: dict[str, int] = {}
+        for field in dataclasses.fields(self):
+            value = self._coerce(field)
+            object.__setattr__(self, field.name, value)
+            self._check_shape(field, value, lengths)
+
+    def _coerce(self, field: "dataclasses.Field[Any]") -> Array:
+        value = getattr(self, field.name)
+        dtype = field.metadata["dtype"]
+        if dtype == "str":
+            return np.asarray([str(item) for item in value], dtype=object)
+        array = np.asarray(value)
+        if array.size and not np.can_cast(array.dtype, dtype, casting="same_kind"):
+            raise ValueError(f"{self.kind}.{field.name} is {array.dtype}, expected {dtype}")
+        array = np.ascontiguousarray(array, dtype=dtype)
+        dims = _dimensions(field.metadata["shape"])
+        if array.size == 0 and array.ndim != len(dims):
+            array = array.reshape([int(d) if d.isdigit() else 0 for d in dims])
+        return array
+
+    def _check_shape(
+        self, field: "dataclasses.Field[Any]", value: Array, lengths: dict[str, int]
+    ) -> None:
+        dims = _dimensions(field.metadata["shape"])
+        if value.ndim != len(dims):
+            raise ValueError(
+                f"{self.kind}.{field.name} has shape {value.shape}, not {field.metadata['shape']}"
+            )
+        for dim, actual in zip(dims, value.shape, strict=True):
+            name, _, more = dim.partition("+")
+            length = actual - int(more or 0)
+            expected = int(name) if name.isdigit() else lengths.setdefault(name, length)
+            if length != expected:
+                raise ValueError(
+                    f"{self.kind}.{field.name} has shape {value.shape}, "
+                    f"not {field.metadata['shape']} with {name}={expected}"
+                )
+
+    def write(self, path: Path | str, header: Header) -> None:
+        """Write the artifact to ``path``, complete or not at all."""
+        with atomic_path(Path(path)) as temporary, h5py.File(temporary, "w") as file:
+            file.attrs["artifact"] = self.kind
+            file.attrs["format_version"] = self.format_version
+            file.attrs["stage"] = header.stage
+            file.attrs["stage_version"] = header.stage_version
+            file.attrs["scene"] = header.scene
+            file.attrs["options"] = header.options
+            file.attrs["software"] = f"snakesfm {snakesfm.__version__}"
+            for field in dataclasses.fields(self):
+                value = getattr(self, field.name)
+                if field.metadata["dtype"] == "str":
+                    file.create_dataset(field.name, data=value, dtype=STRING)
+                else:
+                    file.create_dataset(field.name, data=value)
+
+    @classmethod
+    def read(cls, path: Path | str) -> Self:
+        """Read an artifact.
+
+        Raises
+        ------
+        ArtifactError : the file is missing, damaged, of another kind or of another version.
+        """
+        with cls.open(path) as file:
+            values = {}
+            for field in dataclasses.fields(cls):
+                if field.name not in file:
+                    raise ArtifactError(
+                        f"{path} lacks the dataset '{field.name}': delete the file and run again."
+                    )
+                dataset = file[field.name]
+                if field.metadata["dtype"] == "str":
+                    values[field.name] = dataset.asstr()[()]
+                else:
+                    values[field.name] = dataset[()]
+        return cls(**values)
+
+    @classmethod
+    def open(cls, path: Path | str) -> h5py.File:
+        """Open an artifact's file for reading after checking its kind and version.
+
+        Raises
+        ------
+        ArtifactError : the file is missing, damaged, of another kind or of another version.
+        """
+        try:
+            file = h5py.File(path, "r", locking=False)
+        except FileNotFoundError:
+            raise ArtifactError(f"{path} is missing: run snakemake again to make it.") from None
+        except OSError:
+            raise ArtifactError(
+                f"{path} is damaged or no HDF5 file: delete it and run snakemake again."
+            ) from None
+        kind, version = file.attrs.get("artifact"), file.attrs.get("format_version")
+        if kind != cls.kind or version != cls.format_version:
+            file.close()
+            raise ArtifactError(
+                f"{path} holds '{kind}' version {version}, but '{cls.kind}' version "
+                f"{cls.format_version} is needed: delete it and run snakemake again."
+            )
+        return file
+
+
+def read_header(path: Path | str) -> Mapping[str, Any]:
+    """The root attributes of an artifact's file; empty where it cannot be read."""
+    try:
+        with h5py.File(path, "r", locking=False) as file:
+            return dict(file.attrs)
+    except OSError:
+        return {}
+
+
+class atomic_path:  # noqa: N801 - used as a function, like contextlib's
+    """Context manager: yields a temporary path beside ``path`` and renames it on success."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __enter__(self) -> Path:
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        handle, name = tempfile.mkstemp(prefix=f".{self.path.name}.", dir=self.path.parent)
+        os.close(handle)
+        os.chmod(name, 0o666 & ~_umask())
+        self.temporary = Path(name)
+        return self.temporary
+
+    def __exit__(self, kind: object, error: object, trace: object) -> None:
+        if kind is None:
+            with open(self.temporary, "rb+") as file:
+                os.fsync(file.fileno())
+            os.replace(self.temporary, self.path)
+        else:
+            self.temporary.unlink(missing_ok=True)
+
+
+def _umask() -> int:
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask
+
+
+def write_json(path: Path, content: Any) -> None:
+    """Write JSON with sorted keys, complete or not at all."""
+    with atomic_path(path) as temporary:
+        temporary.write_text(json.dumps(content, indent=1, sort_keys=True) + "\n", "utf-8")

@@ -1,0 +1,71 @@
+"""Columns of artifacts that are spread over the files of all blocks or tiles."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from snakesfm.artifacts.features import LocalFeatures
+from snakesfm.artifacts.pairs import TwoViewGeometries
+
+Array = NDArray[Any]
+
+
+def gather_image_columns(paths: Sequence[Path], count: int, *columns: str) -> list[list[Array]]:
+    """Columns of local features per image of the scene, without reading the others.
+
+    Parameters
+    ----------
+    paths : the LocalFeatures files of all blocks.
+    count : images of the index.
+    columns : names of per-keypoint columns, such as ``keypoints``.
+
+    Returns
+    -------
+    Per column a list over the images; empty arrays for images without features.
+    """
+    gathered: list[list[Array]] = [[np.zeros((0, 0))] * count for _ in columns]
+    for path in paths:
+        with LocalFeatures.open(path) as file:
+            ids, offsets = file["image_ids"][()], file["offsets"][()]
+            for values, name in zip(gathered, columns, strict=True):
+                column = file[name][()]
+                if len(ids) == 0:
+                    continue
+                for row, image in enumerate(ids):
+                    values[image] = column[offsets[row] : offsets[row + 1]]
+    for values in gathered:
+        shape, dtype = next(((v.shape[1:], v.dtype) for v in values if v.size), ((2,), np.dtype("f4")))
+        values[:] = [v if v.size else np.zeros((0, *shape), dtype) for v in values]
+    return gathered
+
+
+def gather_inlier_matches(paths: Sequence[Path], pairs: Array | None = None) -> tuple[Array, Array, Array]:
+    """Inlier matches of accepted pairs of all tiles, sorted by pair.
+
+    Parameters
+    ----------
+    paths : the TwoViewGeometries files of all tiles.
+    pairs : (E,2) the pairs that are wanted; None for all accepted ones.
+
+    Returns
+    -------
+    pairs (P,2) int32, offsets (P+1,) int64 and matches (M,2) int32, keypoint rows in image i and j.
+    """
+    wanted = None if pairs is None else {tuple(pair) for pair in pairs.tolist()}
+    parts: list[tuple[tuple[int, int], Array]] = []
+    for path in paths:
+        with TwoViewGeometries.open(path) as file:
+            tile, rejections = file["pairs"][()], file["rejections"][()]
+            offsets, inliers = file["offsets"][()], file["inliers"][()]
+        for row in np.nonzero(rejections == 0)[0]:
+            pair = (int(tile[row, 0]), int(tile[row, 1]))
+            if wanted is None or pair in wanted:
+                parts.append((pair, inliers[offsets[row] : offsets[row + 1]]))
+    parts.sort(key=lambda part: part[0])
+    rows = np.array([pair for pair, _ in parts], dtype=np.int32).reshape(-1, 2)
+    starts = np.r_[0, np.cumsum([len(matches) for _, matches in parts])].astype(np.int64)
+    matches = np.concatenate([matches for _, matches in parts] or [np.zeros((0, 2), dtype=np.int32)])
+    return rows, starts, matches

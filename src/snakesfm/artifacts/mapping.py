@@ -1,0 +1,81 @@
+"""Artifacts of the averagings, the tracks and the bundle adjustment."""
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+from snakesfm.artifacts.base import Array, Artifact, column
+
+
+@dataclass(frozen=True)
+class CameraRotations(Artifact):
+    """Averaged rotations."""
+
+    kind: ClassVar[str] = "camera_rotations"
+
+    rotations: Array = column("(N,3,3)", "float64", "cam_from_world; NaN where the image has none")
+    residuals_deg: Array = column("(E)", "float64", "per edge of the view graph, NaN where not compared")
+    labels: Array = column("(E)", "int8", "label of the edge after averaging, as in view_graph")
+
+
+@dataclass(frozen=True)
+class TrackTable(Artifact):
+    """Tracks: sets of keypoints that show one point, sorted by image within a track."""
+
+    kind: ClassVar[str] = "tracks"
+
+    offsets: Array = column("(T+1)", "int64", "rows offsets[k]:offsets[k+1] belong to track k")
+    image_ids: Array = column("(L)", "int32", "row of the image in the index")
+    keypoint_ids: Array = column("(L)", "int32", "row of the keypoint in its image")
+    keypoints: Array = column("(L,2)", "float32", "x, y in original pixels")
+    colors: Array = column("(L,3)", "uint8", "RGB of the image at the keypoint")
+
+
+@dataclass(frozen=True)
+class CameraCenters(Artifact):
+    """Averaged camera centres."""
+
+    kind: ClassVar[str] = "camera_centers"
+
+    centers: Array = column("(N,3)", "float64", "camera centre in the world; NaN where there is none")
+    edge_residuals_deg: Array = column("(E)", "float64", "angle of the edge's direction to the centres")
+    edge_used: Array = column("(E)", "bool", "the edge's direction took part")
+    ray_track_ids: Array = column("(Q)", "int64", "track of each camera-landmark ray that took part")
+    ray_residuals_deg: Array = column("(Q)", "float64", "angle of the ray to its landmark")
+
+
+@dataclass(frozen=True)
+class TriangulatedPoints(Artifact):
+    """Points with the observations that agree with them."""
+
+    kind: ClassVar[str] = "triangulated_points"
+
+    points: Array = column("(T,3)", "float64", "point in the world")
+    offsets: Array = column("(T+1)", "int64", "rows offsets[k]:offsets[k+1] belong to point k")
+    image_ids: Array = column("(L)", "int32", "row of the image in the index")
+    keypoint_ids: Array = column("(L)", "int32", "row of the keypoint in its image")
+    keypoints: Array = column("(L,2)", "float32", "x, y in original pixels")
+    colors: Array = column("(T,3)", "uint8", "mean RGB of the observations")
+
+
+@dataclass(frozen=True)
+class Reconstruction(Artifact):
+    """The adjusted model: cameras, poses, points and observations."""
+
+    kind: ClassVar[str] = "reconstruction"
+
+    camera_models: Array = column("(C)", "str", "COLMAP camera model name")
+    camera_sizes: Array = column("(C,2)", "int32", "width and height in pixels")
+    camera_params: Array = column("(C,12)", "float64", "COLMAP parameters in pixels, padded with NaN")
+    rotations: Array = column("(N,3,3)", "float64", "cam_from_world; NaN where not registered")
+    translations: Array = column("(N,3)", "float64", "cam_from_world; NaN where not registered")
+    points: Array = column("(T,3)", "float64", "point in the world")
+    colors: Array = column("(T,3)", "uint8", "mean RGB of the observations")
+    errors_px: Array = column("(T)", "float64", "mean reprojection error of the point")
+    offsets: Array = column("(T+1)", "int64", "rows offsets[k]:offsets[k+1] belong to point k")
+    image_ids: Array = column("(L)", "int32", "row of the image in the index")
+    keypoint_ids: Array = column("(L)", "int32", "row of the keypoint in its image")
+    keypoints: Array = column("(L,2)", "float32", "x, y in original pixels")
+    round_names: Array = column("(B)", "str", "what each round of the adjustment did")
+    round_costs: Array = column("(B,2)", "float64", "robust cost before and after the round")
+    round_counts: Array = column("(B,3)", "int64", "images, points and observations after the round")
+    round_errors_px: Array = column("(B)", "float64", "mean reprojection error after the round")

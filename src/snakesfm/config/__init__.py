@@ -1,0 +1,1 @@
+"""Typed options of every stage, and the configuration that holds them."""

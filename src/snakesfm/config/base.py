@@ -1,0 +1,22 @@
+"""What all options models share."""
+
+import json
+from typing import ClassVar
+
+from pydantic import BaseModel, ConfigDict
+
+
+class StageOptions(BaseModel):
+    """Options of one stage: frozen, typed, and nothing unknown passes.
+
+    ``stage_version`` is bumped when the stage's results change for the same inputs and options; it is part
+    of what Snakemake compares, so the stage and what depends on it run again.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
+
+    stage_version: ClassVar[int] = 1
+
+    def canonical_json(self) -> str:
+        """The options as JSON with sorted keys: equal options give equal text."""
+        return json.dumps(self.model_dump(mode="json"), sort_keys=True)

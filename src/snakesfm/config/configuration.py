@@ -1,0 +1,187 @@
+"""The whole configuration: what config.yaml and ``--config`` may hold."""
+
+import difflib
+import importlib
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, create_model, model_validator
+
+from snakesfm.config.base import StageOptions
+from snakesfm.errors import ConfigError
+
+STAGES: tuple[str, ...] = (
+    "index_images",
+    "extract_features",
+    "learn_vocabulary",
+    "describe_images",
+    "select_pairs",
+    "match_pairs",
+    "calibrate_cameras",
+    "estimate_two_view",
+    "build_view_graph",
+    "filter_view_graph",
+    "average_rotations",
+    "build_tracks",
+    "average_translations",
+    "triangulate_tracks",
+    "adjust_bundle",
+    "export_model",
+    "evaluate_model",
+    "render_report",
+)
+
+SCENE_PATTERN = r"[^/.{}][^/{}]*"
+
+
+def options_class(stage: str) -> type[StageOptions]:
+    """The options model of a stage: ``match_pairs`` has ``MatchPairsOptions``."""
+    module = importlib.import_module(f"snakesfm.config.{stage}")
+    name = "".join(part.capitalize() for part in stage.split("_")) + "Options"
+    cls: type[StageOptions] = getattr(module, name)
+    return cls
+
+
+class SceneInputs(BaseModel):
+    """Where one scene's images and what is known about them are found."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
+
+    images: str
+    """Folder of photographs, searched at any depth."""
+    reference: str = ""
+    """Folder of a COLMAP model to evaluate against; empty for none."""
+    cameras: str = ""
+    """Known intrinsics: a COLMAP cameras.txt (or its folder) or a 3x3 K.txt; empty for none."""
+    intrinsics: Literal["fixed", "refine"] = "fixed"
+    """What bundle adjustment does with known intrinsics: keep them fixed, or refine them."""
+    pairs: str = ""
+    """File of image pairs, one 'name0 name1' a line, for select_pairs.method 'listed'; empty for none."""
+
+
+class RunOptions(BaseModel):
+    """What is not the business of one stage alone."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
+
+    images: str = "demo/images"
+    """Folder of photographs, searched at any depth; unused where `scenes` lists some."""
+    output: str = "results"
+    """Folder that gets one folder per scene."""
+    scene: str = ""
+    """Name of the scene; empty takes the image folder's name (its parent's where that is 'images')."""
+    reference: str = ""
+    """Folder of a COLMAP model to evaluate against; empty for none."""
+    cameras: str = ""
+    """Known intrinsics: a COLMAP cameras.txt (or its folder) or a 3x3 K.txt; empty for none."""
+    intrinsics: Literal["fixed", "refine"] = "fixed"
+    """What bundle adjustment does with known intrinsics: keep them fixed, or refine them."""
+    pairs: str = ""
+    """File of image pairs, one 'name0 name1' a line, for select_pairs.method 'listed'; empty for none."""
+    scenes: dict[str, SceneInputs] = Field(default_factory=dict)
+    """Several scenes: a mapping from name to images, reference, cameras, intrinsics and pairs."""
+    seed: int = Field(default=0, ge=0)
+    """Seed of every random draw; the same seed gives the same model."""
+    blocks: int | Literal["auto"] = "auto"
+    """Blocks that the images are dealt into; B blocks give B(B+1)/2 tiles of pairs, the unit of work."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _accept_numbers(cls, values: Any) -> Any:
+        # --config scene=2024 arrives as a number
+        if isinstance(values, dict):
+            for key in ("images", "output", "scene", "reference", "cameras", "pairs"):
+                if isinstance(values.get(key), int | float) and not isinstance(values[key], bool):
+                    values = {**values, key: str(values[key])}
+            if values.get("scenes") is None and "scenes" in values:
+                values = {**values, "scenes": {}}
+        return values
+
+    @model_validator(mode="after")
+    def _check_blocks(self) -> "RunOptions":
+        if isinstance(self.blocks, int) and self.blocks < 1:
+            raise ValueError("must be 'auto' or a number of at least 1")
+        return self
+
+
+def configuration_class() -> type[RunOptions]:
+    """The model of the whole configuration: RunOptions and one block of options per stage."""
+    fields: dict[str, Any] = {
+        stage: (cls := options_class(stage), Field(default=cls(), description=_first_line(cls)))
+        for stage in STAGES
+    }
+    return create_model("Configuration", __base__=RunOptions, **fields)
+
+
+def _first_line(cls: type) -> str:
+    return (cls.__doc__ or "").strip().splitlines()[0]
+
+
+def load_configuration(values: Mapping[str, Any]) -> RunOptions:
+    """Check a configuration.
+
+    Raises
+    ------
+    ConfigError : an unknown key (the nearest known one is named) or a value out of bounds.
+    """
+    cls = configuration_class()
+    try:
+        return cls(**dict(values))
+    except ValidationError as error:
+        raise ConfigError(_one_sentence(cls, error)) from None
+
+
+def _one_sentence(cls: type[BaseModel], error: ValidationError) -> str:
+    """The first problem in one sentence that names the key and the remedy."""
+    first = error.errors()[0]
+    path = [str(part) for part in first["loc"] if not str(part).startswith("function-")]
+    key = ".".join(path)
+    if first["type"] == "extra_forbidden":
+        known = _keys_beside(cls, path)
+        nearest = difflib.get_close_matches(path[-1], known, n=1, cutoff=0.5)
+        hint = f"did you mean '{nearest[0]}'" if nearest else f"the known keys are {', '.join(known)}"
+        return f"Unknown configuration key '{key}': {hint}?" if nearest else f"Unknown key '{key}': {hint}."
+    message = first["msg"].removeprefix("Value error, ")
+    message = re.sub(r"^Input", "the value", message)
+    return f"Configuration key '{key}' = {first['input']!r}: {message[:1].lower() + message[1:]}."
+
+
+def _keys_beside(cls: type[BaseModel], path: list[str]) -> list[str]:
+    """The keys that are known where an unknown one was found."""
+    if path[0] == "scenes":
+        return list(SceneInputs.model_fields)
+    if len(path) > 1:
+        return list(options_class(path[0]).model_fields)
+    return list(cls.model_fields)
+
+
+def scene_name(images: str) -> str:
+    """The name of a scene: its folder's, or its parent's where the folder is called 'images'."""
+    folder = Path(images).expanduser().resolve()
+    return folder.parent.name if folder.name.lower() == "images" else folder.name
+
+
+def list_scenes(configuration: RunOptions) -> dict[str, SceneInputs]:
+    """The scenes of a run, by name.
+
+    Raises
+    ------
+    ConfigError : a name that cannot be a folder's.
+    """
+    scenes = dict(configuration.scenes)
+    if not scenes:
+        inputs = {key: getattr(configuration, key) for key in SceneInputs.model_fields}
+        scenes = {configuration.scene or scene_name(configuration.images): SceneInputs(**inputs)}
+    elif configuration.images != RunOptions.model_fields["images"].default:
+        raise ConfigError("Give either 'images' or 'scenes', not both: remove one of the two keys.")
+    if re.search("[{}]", configuration.output):
+        raise ConfigError(f"The output folder '{configuration.output}' holds braces: give another output=DIR.")
+    for name in scenes:
+        if not re.fullmatch(SCENE_PATTERN, name):
+            raise ConfigError(
+                f"'{name}' cannot be the name of a scene: give scene=NAME, a name that holds no '/' and no "
+                "braces and does not start with a dot."
+            )
+    return scenes

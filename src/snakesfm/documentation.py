@@ -1,0 +1,179 @@
+"""Makes config.yaml, its JSON schema and the reference pages in docs/ from the code.
+
+``python -m snakesfm.documentation`` rewrites them; a test fails where they differ from the code.
+"""
+
+import dataclasses
+import json
+import textwrap
+from pathlib import Path
+from typing import Any
+
+import yaml
+from pydantic import BaseModel
+from pydantic.fields import FieldInfo
+
+from snakesfm.artifacts import ARTIFACTS
+from snakesfm.config.configuration import (
+    STAGES,
+    RunOptions,
+    SceneInputs,
+    configuration_class,
+    options_class,
+)
+
+WIDTH = 110
+
+
+def render_schema() -> str:
+    """JSON schema of config.yaml, for editors."""
+    schema = configuration_class().model_json_schema()
+    schema["$schema"] = "https://json-schema.org/draft/2020-12/schema"
+    schema["title"] = "snakesfm configuration"
+    return json.dumps(schema, indent=1, sort_keys=True) + "\n"
+
+
+def render_config() -> str:
+    """config.yaml: every option with its default and one sentence."""
+    lines = [
+        "# yaml-language-server: $schema=workflow/schemas/config.schema.json",
+        "# Every option of snakesfm with its default. As it stands it reconstructs the demo scene ('make demo').",
+        "# Change it here, in a file of your own (--configfile FILE) or per run (--config KEY=VALUE).",
+        "# Generated from the code by 'python -m snakesfm.documentation'.",
+        "",
+    ]
+    for name, field in RunOptions.model_fields.items():
+        lines += _yaml_option(name, field, "")
+    for stage in STAGES:
+        cls = options_class(stage)
+        lines += ["", f"# {_sentence(cls)}"]
+        if cls.model_fields:
+            lines.append(f"{stage}:")
+            for name, field in cls.model_fields.items():
+                lines += _yaml_option(name, field, "  ")
+        else:
+            lines.append(f"{stage}: {{}}")
+    return "\n".join(lines) + "\n"
+
+
+def _sentence(cls: type) -> str:
+    return " ".join((cls.__doc__ or "").strip().split("\n\n")[0].split())
+
+
+def _yaml_option(name: str, field: FieldInfo, indent: str) -> list[str]:
+    comment = textwrap.wrap(" ".join((field.description or "").split()), WIDTH - len(indent))
+    default = field.get_default(call_default_factory=True)
+    value = default.model_dump(mode="json") if isinstance(default, BaseModel) else default
+    value = list(value) if isinstance(value, tuple) else value
+    text = yaml.safe_dump({name: value}, default_flow_style=True, allow_unicode=True, width=1000)
+    return [f"{indent}# {line}" for line in comment] + [indent + text.strip()[1:-1]]
+
+
+def render_configuration_page() -> str:
+    """docs/configuration.md."""
+    lines = [
+        "# Configuration",
+        "",
+        "Generated from the options models by `python -m snakesfm.documentation`; do not edit.",
+        "",
+        "Options are read from `config.yaml`, then from files given with `--configfile`, then from "
+        "`--config KEY=VALUE`; stage options nest: `--config 'extract_features={max_keypoints: 8000}'`. "
+        "Unknown keys are refused. Threads, memory and partitions are no options: they belong to the profile.",
+        "",
+        "## The run",
+        "",
+        *_table(RunOptions),
+        "",
+        "### Each scene under `scenes`",
+        "",
+        *_table(SceneInputs),
+    ]
+    for stage in STAGES:
+        cls = options_class(stage)
+        lines += ["", f"## {stage}", "", _sentence(cls)]
+        if cls.model_fields:
+            lines += ["", *_table(cls)]
+    return "\n".join(lines) + "\n"
+
+
+def _table(cls: type[BaseModel]) -> list[str]:
+    properties = cls.model_json_schema()["properties"]
+    rows = ["| key | default | allowed | meaning |", "|---|---|---|---|"]
+    for name, field in cls.model_fields.items():
+        default = "required" if field.is_required() else _plain(field.get_default(call_default_factory=True))
+        meaning = " ".join((field.description or "").split())
+        rows.append(f"| `{name}` | {default} | {_allowed(properties[name])} | {meaning} |")
+    return rows
+
+
+def _plain(value: Any) -> str:
+    if isinstance(value, BaseModel):
+        value = value.model_dump(mode="json")
+    return f"`{json.dumps(value)}`"
+
+
+def _allowed(schema: dict[str, Any]) -> str:
+    if "anyOf" in schema:
+        return " or ".join(_allowed(part) for part in schema["anyOf"])
+    if "enum" in schema:
+        return ", ".join(f"`{value}`" for value in schema["enum"])
+    if "const" in schema:
+        return f"`{schema['const']}`"
+    text = {"null": "nothing", "object": "mapping", "array": "list"}.get(
+        schema.get("type", "object"), schema.get("type", "mapping")
+    )
+    signs = {"minimum": ">=", "exclusiveMinimum": ">", "maximum": "<=", "exclusiveMaximum": "<"}
+    limits = [f"{sign} {schema[key]:g}" for key, sign in signs.items() if key in schema]
+    return " ".join([text, ", ".join(limits)]).strip()
+
+
+def render_artifacts_page() -> str:
+    """docs/artifacts.md."""
+    lines = [
+        "# Artifacts",
+        "",
+        "Generated from `src/snakesfm/artifacts` by `python -m snakesfm.documentation`; do not edit.",
+        "",
+        "Every stage writes HDF5 files at `OUTPUT/SCENE/STAGE/FILE.h5`, one job one file, complete or not at all. "
+        "The root attributes are `artifact` (the kind below), `format_version`, `stage`, `stage_version`, `scene`, "
+        "`options` (canonical JSON) and `software`; there are no timestamps, so equal runs give equal bytes. "
+        "Readers refuse another kind or version.",
+        "",
+        "Letters in shapes are lengths: the same letter is the same length within one file, and `P+1` is one more "
+        "than `P`. Flat tables of things that belong to others (matches of a pair, keypoints of an image) come with "
+        "row offsets. Poses are named target_from_source: `cam_from_world` maps the world to the camera, "
+        "`j_from_i` maps camera i to camera j. The centre of the top-left pixel is (0.5, 0.5).",
+    ]
+    for cls in ARTIFACTS:
+        lines += [
+            "",
+            f"## {cls.kind} (version {cls.format_version})",
+            "",
+            _sentence(cls),
+            "",
+            "| dataset | shape | dtype | meaning |",
+            "|---|---|---|---|",
+        ]
+        for field in dataclasses.fields(cls):
+            meta = field.metadata
+            dtype = "UTF-8 string" if meta["dtype"] == "str" else meta["dtype"]
+            lines.append(f"| `{field.name}` | {meta['shape']} | {dtype} | {meta['description']} |")
+    return "\n".join(lines) + "\n"
+
+
+GENERATED = {
+    "workflow/schemas/config.schema.json": render_schema,
+    "config.yaml": render_config,
+    "docs/configuration.md": render_configuration_page,
+    "docs/artifacts.md": render_artifacts_page,
+}
+
+
+def main() -> None:
+    """Rewrite all generated files below the current folder."""
+    for name, render in GENERATED.items():
+        Path(name).write_text(render(), "utf-8")
+
+
+if __name__ == "__main__":
+    main()

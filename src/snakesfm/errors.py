@@ -1,0 +1,30 @@
+"""The errors that a user can cause and mend.
+
+SnakesfmError            anything that ends a job with one clear sentence
+├── ConfigError          an option, a key of config.yaml or a path named there
+├── ImageError           one image cannot be used (the others go on)
+├── SceneError           a scene as a whole cannot be reconstructed
+└── ArtifactError        a file that a stage reads is missing, damaged or of another version
+
+Every message is one sentence that names the file or key and says what to do.
+"""
+
+
+class SnakesfmError(Exception):
+    """An error whose message alone is shown to the user, without a traceback."""
+
+
+class ConfigError(SnakesfmError):
+    """A configuration that cannot be run."""
+
+
+class ImageError(SnakesfmError):
+    """An image that cannot be read or used."""
+
+
+class SceneError(SnakesfmError):
+    """A scene that cannot be reconstructed."""
+
+
+class ArtifactError(SnakesfmError):
+    """An artifact that cannot be read."""

@@ -1,0 +1,87 @@
+"""Camera intrinsics in COLMAP's models."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import cv2  # noqa: F401 - must be loaded before pycolmap, whose PNG library clashes otherwise
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+Array = NDArray[Any]
+PARAM_SLOTS = 12
+
+
+@dataclass(frozen=True)
+class Camera:
+    """Intrinsics of one camera.
+
+    Parameters
+    ----------
+    model : COLMAP camera model name, such as ``PINHOLE`` or ``SIMPLE_RADIAL``.
+    width, height : image size in pixels.
+    params : COLMAP's parameters in pixels, in COLMAP's order.
+    source : where the focal length comes from: given, exif, estimated, default.
+    """
+
+    model: str
+    width: int
+    height: int
+    params: tuple[float, ...]
+    source: str = "given"
+
+    def to_pycolmap(self, camera_id: int = 1) -> pycolmap.Camera:
+        """The same camera for pycolmap."""
+        return pycolmap.Camera(
+            camera_id=camera_id,
+            model=self.model,
+            width=self.width,
+            height=self.height,
+            params=list(self.params),
+        )
+
+    def normalize(self, keypoints: Array) -> Array:
+        """Pixels (N,2) to undistorted points (N,2) on the plane z = 1 of the camera frame."""
+        if len(keypoints) == 0:
+            return np.zeros((0, 2))
+        points = self.to_pycolmap().cam_from_img(np.asarray(keypoints, dtype=np.float64))
+        return np.asarray(points).reshape(-1, 2)
+
+    @property
+    def focal_px(self) -> float:
+        """Mean focal length in pixels."""
+        return float(self.to_pycolmap().mean_focal_length())
+
+    def with_focal(self, focal_px: float, source: str) -> "Camera":
+        """The same camera with another mean focal length in pixels."""
+        camera = self.to_pycolmap()
+        scale = focal_px / camera.mean_focal_length()
+        params = np.array(camera.params)
+        params[camera.focal_length_idxs()] *= scale
+        return replace(self, params=tuple(params.tolist()), source=source)
+
+
+def cameras_to_columns(cameras: Sequence[Camera]) -> tuple[list[str], Array, Array, list[str]]:
+    """Cameras as columns of an artifact: models, sizes (C,2), params (C,12), sources."""
+    params = np.full((len(cameras), PARAM_SLOTS), np.nan)
+    for row, camera in enumerate(cameras):
+        params[row, : len(camera.params)] = camera.params
+    sizes = np.array([(c.width, c.height) for c in cameras], dtype=np.int32).reshape(-1, 2)
+    return [c.model for c in cameras], sizes, params, [c.source for c in cameras]
+
+
+def cameras_from_columns(
+    models: Array, sizes: Array, params: Array, sources: Array | None = None
+) -> list[Camera]:
+    """Inverse of :func:`cameras_to_columns`."""
+    return [
+        Camera(
+            str(models[row]),
+            int(sizes[row, 0]),
+            int(sizes[row, 1]),
+            tuple(params[row][~np.isnan(params[row])].tolist()),
+            "given" if sources is None else str(sources[row]),
+        )
+        for row in range(len(models))
+    ]

@@ -1,0 +1,118 @@
+"""From a Snakemake job to a stage's ``run``: the log, the errors and the former file."""
+
+import importlib
+import json
+import os
+import sys
+import time
+import traceback
+from pathlib import Path
+from typing import Any
+
+THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+
+
+def run_job(stage: str, snakemake: Any) -> None:
+    """Run one stage as a Snakemake job.
+
+    Standard output and error of this process, C++ libraries included, go to the job's log; progress and the one
+    sentence of an error go to the terminal too.
+
+    Parameters
+    ----------
+    stage : verb_noun name of the stage.
+    snakemake : the object that Snakemake gives to a script.
+    """
+    for variable in THREAD_VARIABLES:
+        os.environ[variable] = "1"
+    terminal = _redirect_to_log(Path(snakemake.log[0]))
+    started = time.monotonic()
+    try:
+        job = _bind(stage, snakemake, terminal)
+        print(f"{stage} {job.output}", flush=True)
+        importlib.import_module(f"snakesfm.stages.{stage}").run(job)
+        _keep_former(job)
+    except Exception as error:
+        _fail(stage, snakemake, error, terminal)
+    print(f"{stage} done in {time.monotonic() - started:.1f} s", flush=True)
+
+
+def _redirect_to_log(path: Path) -> Any:
+    """Send file descriptors 1 and 2 to the log; return a stream to the terminal."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    terminal = os.fdopen(os.dup(2), "w", buffering=1)
+    log = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o666)
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os.dup2(log, 1)
+    os.dup2(log, 2)
+    os.close(log)
+    return terminal
+
+
+def _bind(stage: str, snakemake: Any, terminal: Any) -> Any:
+    """The StageJob of a Snakemake job."""
+    from snakesfm.config.configuration import options_class
+    from snakesfm.stages.job import Progress, StageJob
+
+    content = json.loads(snakemake.params.job)
+    outputs = tuple(Path(path) for path in snakemake.output)
+    former = former_path(outputs[0])
+    Progress.terminal = terminal
+    return StageJob(
+        stage=stage,
+        scene=snakemake.wildcards.scene,
+        inputs={
+            name: value if isinstance(value, str) else list(value)
+            for name, value in snakemake.input.items()
+        },
+        outputs=outputs,
+        options=options_class(stage)(**content["options"]),
+        settings=content["settings"],
+        seed=content["seed"],
+        threads=snakemake.threads,
+        former=former if former.is_file() else None,
+    )
+
+
+def former_path(output: Path) -> Path:
+    """Where the last complete version of an output is kept while Snakemake re-makes it."""
+    return output.parent / ".former" / output.name
+
+
+def _keep_former(job: Any) -> None:
+    """Hard-link the finished output of a stage that reuses unchanged parts of its former file."""
+    module = importlib.import_module(f"snakesfm.stages.{job.stage}")
+    if not getattr(module, "REUSES_FORMER", False):
+        return
+    former = former_path(job.output)
+    temporary = former.with_name(f"{former.name}.{os.getpid()}")
+    try:
+        former.parent.mkdir(exist_ok=True)
+        os.link(job.output, temporary)
+        os.replace(temporary, former)
+    except OSError as error:
+        print(f"warning: {former} could not be kept ({error}); a re-run computes everything anew.")
+
+
+def _fail(stage: str, snakemake: Any, error: Exception, terminal: Any) -> None:
+    """Say what went wrong, in the log and on the terminal, and end with exit status 1."""
+    from snakesfm.errors import SnakesfmError
+
+    scene = snakemake.wildcards.scene
+    if isinstance(error, SnakesfmError):
+        sentence = str(error)
+    elif isinstance(error, OSError) and error.strerror:
+        where = f" '{error.filename}'" if error.filename else ""
+        sentence = f"{error.strerror}{where}: free the disk or correct the permission, then run again."
+        traceback.print_exc()
+    elif isinstance(error, MemoryError):
+        sentence = "Not enough memory: give the job more mem_mb, or use more blocks."
+        traceback.print_exc()
+    else:
+        traceback.print_exc()
+        sentence = f"Unexpected {type(error).__name__}: {error}; the log {snakemake.log[0]} holds the details."
+    print(f"error: {sentence}", flush=True)
+    print(f"snakesfm: scene '{scene}', {stage}: {sentence}", file=terminal, flush=True)
+    sys.stdout.flush()
+    sys.exit(1)

@@ -1,0 +1,194 @@
+"""What the Snakefile asks: which scenes, blocks, tiles and params there are.
+
+Everything here is computed from the configuration and the listing of the image folders, so the graph of jobs
+is known before anything runs.
+"""
+
+import functools
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from snakesfm.config.base import StageOptions
+from snakesfm.config.configuration import SceneInputs, list_scenes, load_configuration
+from snakesfm.config.select_pairs import SelectPairsOptions
+from snakesfm.errors import ConfigError
+from snakesfm.ingest.discover import count_images, fingerprint_images
+
+# images up to which so many blocks are used; powers of two, so that adding images rarely re-deals them
+BLOCK_LADDER = ((60, 2), (500, 4), (1_500, 8), (4_000, 16), (15_000, 32), (50_000, 64))
+MOST_BLOCKS = 128
+
+
+def choose_blocks(image_count: int) -> int:
+    """The number of blocks for a number of images where the configuration says 'auto'."""
+    for most_images, blocks in BLOCK_LADDER:
+        if image_count <= most_images:
+            return blocks
+    return MOST_BLOCKS
+
+
+def tile_names(blocks: int) -> list[str]:
+    """The tiles 'a-b', a <= b, of the matrix of image pairs."""
+    return [f"{a}-{b}" for a in range(blocks) for b in range(a, blocks)]
+
+
+class ScenePlan:
+    """One scene's blocks, tiles and what its stages are told."""
+
+    def __init__(self, name: str, inputs: SceneInputs, configuration: Any, output: Path) -> None:
+        self.name = name
+        self.inputs = inputs
+        self.configuration = configuration
+        self.folder = output / name
+        self._check_paths()
+
+    def _check_paths(self) -> None:
+        images = Path(self.inputs.images).expanduser()
+        if not images.is_dir():
+            hint = "make it with 'make demo', or " if self.inputs.images == "demo/images" else ""
+            raise ConfigError(
+                f"The image folder '{images}' does not exist: {hint}say which folder with "
+                "--config images=PATH."
+            )
+        if count_images(images, 1) == 0:
+            raise ConfigError(
+                f"The folder '{images}' holds no JPEG, PNG, TIFF or WebP image: "
+                "say with --config images=PATH which folder does."
+            )
+        for key in ("reference", "cameras", "pairs"):
+            path = getattr(self.inputs, key)
+            if path and not Path(path).expanduser().exists():
+                raise ConfigError(
+                    f"'{path}', given as {key}= for scene '{self.name}', does not exist: "
+                    "correct the path or remove the key."
+                )
+
+    @property
+    def images(self) -> Path:
+        """The image folder."""
+        return Path(self.inputs.images).expanduser()
+
+    @functools.cached_property
+    def image_count(self) -> int:
+        """Number of files that look like images."""
+        return count_images(self.images, None)
+
+    @functools.cached_property
+    def blocks(self) -> int:
+        """Number of blocks."""
+        blocks = self.configuration.blocks
+        return choose_blocks(self.image_count) if blocks == "auto" else int(blocks)
+
+    @functools.cached_property
+    def select_pairs(self) -> SelectPairsOptions:
+        """How pairs are chosen, with 'auto' resolved."""
+        options: SelectPairsOptions = self.configuration.select_pairs
+        return options.resolve(self.image_count) if options.method == "auto" else options
+
+    def options(self, stage: str) -> StageOptions:
+        """The options of a stage in this scene."""
+        options: StageOptions = self.configuration.__getattribute__(stage)
+        return self.select_pairs if stage == "select_pairs" else options
+
+    def files(self, stage: str, parts: str) -> list[str]:
+        """All files of a stage that works on 'blocks' or on 'tiles'."""
+        names = tile_names(self.blocks) if parts == "tiles" else map(str, range(self.blocks))
+        return [str(self.folder / stage / f"{name}.h5") for name in names]
+
+    def tile_features(self, tile: str) -> list[str]:
+        """The one or two feature blocks that a tile reads."""
+        blocks = sorted({int(block) for block in tile.split("-")})
+        return [str(self.folder / "extract_features" / f"{block}.h5") for block in blocks]
+
+    def global_descriptors(self) -> list[str]:
+        """The global descriptors of all blocks where pairs are retrieved, else nothing."""
+        return self.files("describe_images", "blocks") if self.select_pairs.needs_descriptors else []
+
+    def final_files(self) -> list[str]:
+        """What a run makes of the scene: its model, its metrics and its report."""
+        names = ("export_model/summary.json", "evaluate_model/metrics.json", "render_report/index.html")
+        return [str(self.folder / name) for name in names]
+
+    @functools.cached_property
+    def _fingerprint(self) -> str:
+        return fingerprint_images(self.images, self.folder / "index_images" / "digests.json")
+
+    def settings(self, stage: str, wildcards: Mapping[str, str], main_process: bool) -> dict[str, Any]:
+        """What a stage is told beside its options."""
+        inputs = self.inputs
+        if stage == "index_images":
+            # only the controller compares params, so only it reads the images to see whether they changed
+            content = self._fingerprint if main_process else ""
+            return {
+                "images": str(self.images),
+                "cameras": inputs.cameras,
+                "cameras_content": _file_digest(inputs.cameras),
+                "blocks": self.blocks,
+                "content": content,
+            }
+        if stage == "extract_features":
+            return {"images": str(self.images), "block": int(wildcards["block"])}
+        if stage == "select_pairs":
+            return {
+                "blocks": self.blocks,
+                "pairs_file": inputs.pairs,
+                "pairs_content": _file_digest(inputs.pairs),
+            }
+        if stage == "adjust_bundle":
+            return {"intrinsics": inputs.intrinsics}
+        if stage == "export_model":
+            return {"images": str(self.images)}
+        if stage == "evaluate_model":
+            return {"reference": inputs.reference, "reference_content": _file_digest(inputs.reference)}
+        return {}
+
+    def params(self, stage: str, wildcards: Mapping[str, str], main_process: bool) -> str:
+        """All that determines a job's result beside its input files, as one canonical JSON string."""
+        options = self.options(stage)
+        content = {
+            "options": json.loads(options.canonical_json()),
+            "stage_version": options.stage_version,
+            "settings": self.settings(stage, wildcards, main_process),
+            "seed": self.configuration.seed,
+        }
+        return json.dumps(content, sort_keys=True)
+
+
+@functools.cache
+def _file_digest(path: str) -> str:
+    """SHA-256 of a small file, or of the cameras, images and points files of a folder; '' for no path."""
+    import hashlib
+
+    if not path:
+        return ""
+    root = Path(path).expanduser()
+    files = [root] if root.is_file() else sorted(p for p in root.rglob("*") if p.suffix in {".txt", ".bin"})
+    digest = hashlib.sha256()
+    for file in files:
+        digest.update(file.name.encode() + b"\0" + file.read_bytes())
+    return digest.hexdigest()
+
+
+class Plan:
+    """All scenes of a run."""
+
+    def __init__(self, config: Mapping[str, Any]) -> None:
+        configuration = load_configuration(config)
+        self.output = Path(configuration.output).expanduser()
+        self.scenes = {
+            name: ScenePlan(name, inputs, configuration, self.output)
+            for name, inputs in list_scenes(configuration).items()
+        }
+
+    def scenes_by_blocks(self) -> dict[int, list[str]]:
+        """The names of the scenes that have each number of blocks."""
+        groups: dict[int, list[str]] = {}
+        for name, scene in self.scenes.items():
+            groups.setdefault(scene.blocks, []).append(name)
+        return groups
+
+    def select_pairs_rule(self, blocks: int) -> str:
+        """The name of the rule select_pairs for a number of blocks; plain where one rule serves all scenes."""
+        return "select_pairs" if len(self.scenes_by_blocks()) == 1 else f"select_pairs_{blocks}_blocks"

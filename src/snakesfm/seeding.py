@@ -1,0 +1,20 @@
+"""Seeds that depend on what is worked on, never on the order or the number of jobs."""
+
+import hashlib
+
+
+def derive_seed(seed: int, *names: str) -> int:
+    """A 31-bit seed for one random draw.
+
+    Parameters
+    ----------
+    seed : the run's seed.
+    names : stage and names of what is worked on, such as the two image names of a pair.
+    """
+    text = "\0".join((str(seed), *names))
+    return int.from_bytes(hashlib.sha256(text.encode()).digest()[:4], "big") >> 1
+
+
+def block_of(name: str, blocks: int) -> int:
+    """The block of an image: a stable hash of its relative name, in 0 .. blocks-1."""
+    return int.from_bytes(hashlib.sha256(name.encode()).digest()[8:16], "big") % blocks

@@ -1,0 +1,94 @@
+"""What a stage gets to work with, wherever it runs."""
+
+import sys
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, TextIO
+
+from snakesfm.artifacts.base import Header
+from snakesfm.config.base import StageOptions
+from snakesfm.seeding import derive_seed
+
+
+@dataclass(frozen=True)
+class StageJob:
+    """One job of one stage.
+
+    Parameters
+    ----------
+    stage : verb_noun name of the stage.
+    scene : name of the scene.
+    inputs : named inputs of the rule; a list where the rule gathers several files.
+    outputs : all files of the rule; ``output`` is the first, and the only one of most stages.
+    options : the stage's options model.
+    settings : what is no option but changes the result, such as the image folder or the number of blocks.
+    seed : the run's seed.
+    threads : how many threads may be used; results never depend on it.
+    former : an earlier version of the output whose unchanged parts may be taken over, or None.
+    """
+
+    stage: str
+    scene: str
+    inputs: Mapping[str, Any]
+    outputs: tuple[Path, ...]
+    options: Any
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    seed: int = 0
+    threads: int = 1
+    former: Path | None = None
+
+    @property
+    def output(self) -> Path:
+        """The artifact to write, complete or not at all."""
+        return self.outputs[0]
+
+    @property
+    def header(self) -> Header:
+        """The root attributes of the artifact that this job writes."""
+        options: StageOptions = self.options
+        return Header(self.stage, options.stage_version, self.scene, options.canonical_json())
+
+    def path(self, name: str) -> Path:
+        """The one file of a named input."""
+        return Path(self.inputs[name])
+
+    def paths(self, name: str) -> list[Path]:
+        """All files of a named input, in the rule's order."""
+        value = self.inputs[name]
+        if isinstance(value, str | Path):
+            value = [value]
+        return [Path(item) for item in value]
+
+    def seed_for(self, *names: str) -> int:
+        """A seed for one random draw of this stage, from the run's seed and what it works on."""
+        return derive_seed(self.seed, self.stage, *names)
+
+    def progress(self, total: int, what: str) -> "Progress":
+        """A counter that prints how far the job is, at most every five seconds."""
+        return Progress(f"{self.scene}: {self.stage} {self.output.stem}", total, what)
+
+
+class Progress:
+    """Counts work that is done and says so, in the log and on the terminal."""
+
+    interval_s = 5.0
+    terminal: TextIO | None = None
+
+    def __init__(self, label: str, total: int, what: str) -> None:
+        self.label = label
+        self.total = total
+        self.what = what
+        self.done = 0
+        self.last = time.monotonic()
+
+    def step(self, count: int = 1) -> None:
+        """Count ``count`` more items as done."""
+        self.done += count
+        now = time.monotonic()
+        if now - self.last >= self.interval_s and self.done < self.total:
+            self.last = now
+            line = f"{self.label}: {self.done} of {self.total} {self.what}"
+            for stream in filter(None, (sys.stderr, self.terminal)):
+                print(line, file=stream, flush=True)

@@ -1,0 +1,121 @@
+"""Artifacts: round trips, checks of shape and dtype, and damaged files."""
+
+import dataclasses
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from snakesfm.artifacts import ARTIFACTS, Artifact, Header, ImagePairs, PairMatches, ViewGraph
+from snakesfm.artifacts.base import atomic_path
+from snakesfm.errors import ArtifactError
+
+HEADER = Header("match_pairs", 3, "castle", '{"ratio": 0.8}')
+
+
+def example(cls: type[Artifact], lengths: dict[str, int]) -> Artifact:
+    """An artifact with random content of the given lengths."""
+    rng = np.random.default_rng(7)
+    values = {}
+    for field in dataclasses.fields(cls):
+        shape = []
+        for dim in field.metadata["shape"].strip("()").split(","):
+            name, _, more = dim.strip().partition("+")
+            shape.append(int(name) if name.isdigit() else lengths.get(name, 3) + int(more or 0))
+        if field.metadata["dtype"] == "str":
+            values[field.name] = [f"näme {{{k}}} #{k}.JPG" for k in range(shape[0])]
+        elif field.metadata["dtype"] == "bool":
+            values[field.name] = rng.random(shape) < 0.5
+        elif field.metadata["dtype"].startswith("float"):
+            values[field.name] = rng.normal(size=shape).astype(field.metadata["dtype"])
+        else:
+            values[field.name] = rng.integers(0, 100, shape).astype(field.metadata["dtype"])
+    return cls(**values)
+
+
+@pytest.mark.parametrize("cls", ARTIFACTS, ids=lambda c: c.kind)
+@pytest.mark.parametrize("length", [0, 1, 5])
+def test_round_trip_is_exact_and_bytes_repeat(cls: type[Artifact], length: int, tmp_path: Path) -> None:
+    names = {d for f in dataclasses.fields(cls) for d in f.metadata["shape"] if d.isalpha()}
+    original = example(cls, dict.fromkeys(names, length))
+    original.write(tmp_path / "a.h5", HEADER)
+    original.write(tmp_path / "b.h5", HEADER)
+    assert (tmp_path / "a.h5").read_bytes() == (tmp_path / "b.h5").read_bytes()
+    back = cls.read(tmp_path / "a.h5")
+    for field in dataclasses.fields(cls):
+        np.testing.assert_array_equal(getattr(back, field.name), getattr(original, field.name))
+        assert getattr(back, field.name).dtype == getattr(original, field.name).dtype
+
+
+@pytest.mark.parametrize("cls", ARTIFACTS, ids=lambda c: c.kind)
+def test_every_column_says_shape_type_and_meaning(cls: type[Artifact]) -> None:
+    for field in dataclasses.fields(cls):
+        assert field.metadata["shape"].startswith("(")
+        assert len(field.metadata["description"]) > 10
+
+
+def test_header_is_in_the_root_attributes(tmp_path: Path) -> None:
+    ImagePairs(pairs=[], reasons=[], similarities=[]).write(tmp_path / "a.h5", HEADER)
+    with h5py.File(tmp_path / "a.h5") as file:
+        assert file.attrs["artifact"] == "image_pairs"
+        assert file.attrs["stage"] == "match_pairs"
+        assert file.attrs["stage_version"] == 3
+        assert file.attrs["scene"] == "castle"
+        assert file.attrs["options"] == '{"ratio": 0.8}'
+
+
+def test_lengths_that_disagree_are_refused() -> None:
+    with pytest.raises(ValueError, match="reasons"):
+        ImagePairs(pairs=[[0, 1]], reasons=[], similarities=[0.0])
+    with pytest.raises(ValueError, match="offsets"):
+        PairMatches(pairs=[[0, 1]], digests=["x"], offsets=[0], matches=[], scores=[])
+
+
+def test_a_dtype_that_would_lose_information_is_refused() -> None:
+    with pytest.raises(ValueError, match="pairs"):
+        ImagePairs(pairs=[[0.5, 1.5]], reasons=["x"], similarities=[0.0])
+
+
+@pytest.mark.parametrize("keep", [0, 10, 700])
+def test_a_truncated_file_gives_one_sentence(tmp_path: Path, keep: int) -> None:
+    path = tmp_path / "a.h5"
+    ImagePairs(pairs=[[0, 1]], reasons=["x"], similarities=[0.5]).write(path, HEADER)
+    path.write_bytes(path.read_bytes()[:keep])
+    with pytest.raises(ArtifactError, match="damaged") as caught:
+        ImagePairs.read(path)
+    assert str(path) in str(caught.value)
+
+
+def test_another_kind_another_version_and_no_file_give_one_sentence(tmp_path: Path) -> None:
+    path = tmp_path / "a.h5"
+    with pytest.raises(ArtifactError, match="missing"):
+        ImagePairs.read(path)
+    ImagePairs(pairs=[], reasons=[], similarities=[]).write(path, HEADER)
+    with pytest.raises(ArtifactError, match="view_graph"):
+        ViewGraph.read(path)
+    with h5py.File(path, "a") as file:
+        file.attrs["format_version"] = 99
+    with pytest.raises(ArtifactError, match="99"):
+        ImagePairs.read(path)
+
+
+def test_a_failing_writer_leaves_the_old_file_and_no_rest(tmp_path: Path) -> None:
+    path = tmp_path / "a.txt"
+    path.write_text("old")
+    with pytest.raises(RuntimeError), atomic_path(path) as temporary:
+        temporary.write_text("half")
+        raise RuntimeError
+    assert path.read_text() == "old"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.lists(st.text(min_size=1, max_size=12).filter(lambda t: "\0" not in t and t.isprintable()), max_size=5))
+def test_any_text_survives(tmp_path_factory: pytest.TempPathFactory, texts: list[str]) -> None:
+    path = tmp_path_factory.mktemp("text") / "a.h5"
+    pairs = np.zeros((len(texts), 2), dtype=np.int32)
+    ImagePairs(pairs=pairs, reasons=texts, similarities=np.zeros(len(texts))).write(path, HEADER)
+    assert list(ImagePairs.read(path).reasons) == texts

@@ -1,0 +1,80 @@
+"""The configuration: unknown keys, wrong values, scenes."""
+
+import json
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from snakesfm.config.configuration import (
+    STAGES,
+    list_scenes,
+    load_configuration,
+    options_class,
+    scene_name,
+)
+from snakesfm.errors import ConfigError
+
+
+@pytest.mark.parametrize(
+    ("values", "parts"),
+    [
+        ({"imges": "x"}, ["imges", "images"]),
+        ({"extract_features": {"max_keypoint": 3}}, ["extract_features.max_keypoint", "max_keypoints"]),
+        ({"match_pair": {}}, ["match_pair", "match_pairs"]),
+        ({"scenes": {"a": {"images": "x", "camera": "y"}}}, ["scenes.a.camera", "cameras"]),
+        ({"extract_features": {"max_keypoints": "many"}}, ["extract_features.max_keypoints", "many"]),
+        ({"seed": -1}, ["seed", "-1"]),
+        ({"blocks": 0}, ["blocks"]),
+        ({"intrinsics": "free"}, ["intrinsics", "fixed", "refine"]),
+        ({"zzzzqqqq": 1}, ["zzzzqqqq", "known keys"]),
+    ],
+)
+def test_a_wrong_key_or_value_gives_one_sentence_that_names_it(values: dict, parts: list[str]) -> None:
+    with pytest.raises(ConfigError) as caught:
+        load_configuration(values)
+    message = str(caught.value)
+    assert "\n" not in message
+    for part in parts:
+        assert part in message
+
+
+def test_scene_takes_the_name_of_its_folder_or_of_its_parent() -> None:
+    assert scene_name("/data/castle") == "castle"
+    assert scene_name("/data/castle/images") == "castle"
+    assert scene_name("/data/castle/Images/") == "castle"
+
+
+def test_numbers_from_the_command_line_are_names() -> None:
+    assert list(list_scenes(load_configuration({"images": "x", "scene": 2024}))) == ["2024"]
+
+
+def test_scenes_replace_images_and_both_are_refused() -> None:
+    scenes = {"a": {"images": "x"}, "b": {"images": "y", "intrinsics": "refine"}}
+    listed = list_scenes(load_configuration({"scenes": scenes}))
+    assert list(listed) == ["a", "b"]
+    assert listed["b"].intrinsics == "refine"
+    with pytest.raises(ConfigError, match="not both"):
+        list_scenes(load_configuration({"scenes": scenes, "images": "z"}))
+
+
+@pytest.mark.parametrize("name", ["../up", ".hidden", "a/b"])
+def test_a_scene_name_that_is_no_folder_name_is_refused(name: str) -> None:
+    with pytest.raises(ConfigError, match="scene=NAME"):
+        list_scenes(load_configuration({"images": "x", "scene": name}))
+
+
+@pytest.mark.parametrize("stage", STAGES)
+def test_options_render_to_canonical_json_and_back(stage: str) -> None:
+    options = options_class(stage)()
+    text = options.canonical_json()
+    assert options_class(stage)(**json.loads(text)) == options
+    assert json.dumps(json.loads(text), sort_keys=True) == text
+
+
+@given(st.permutations(["ratio", "method"]))
+def test_canonical_json_does_not_depend_on_the_order_of_keys(keys: list[str]) -> None:
+    cls = options_class("match_pairs")
+    defaults = cls().model_dump()
+    values = {key: defaults[key] for key in keys if key in defaults}
+    assert cls(**values).canonical_json() == cls().canonical_json()

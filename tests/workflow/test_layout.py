@@ -1,0 +1,92 @@
+"""One name in all places: rule, script, stage module, options, results folder."""
+
+import ast
+import re
+from pathlib import Path
+
+import pytest
+
+from snakesfm.config.configuration import STAGES, configuration_class, options_class
+
+DOMAIN_MAY_IMPORT_NOT = ("snakesfm.stages", "snakesfm.artifacts", "snakesfm.plan", "snakesfm.job", "h5py", "snakemake")
+NO_DOMAIN = {"stages", "artifacts", "config"}
+
+
+def rule_texts(root: Path) -> dict[str, str]:
+    """Rule name to text, of all rule files."""
+    rules = {}
+    for file in sorted((root / "workflow" / "rules").glob("*.smk")):
+        text = file.read_text()
+        for match in re.finditer(r"^( *)rule (?:(\w+))?:\n(.*?)(?=^\S|\Z)", text, re.M | re.S):
+            script = re.search(r"scripts/(\w+)\.py", match[3])
+            rules[match[2] or script[1]] = match[3]
+    return rules
+
+
+def test_every_stage_has_one_rule_script_module_and_config_block(root: Path) -> None:
+    stages = set(STAGES)
+    assert set(rule_texts(root)) == stages
+    assert {p.stem for p in (root / "scripts").iterdir()} == stages
+    assert {p.stem for p in (root / "src/snakesfm/stages").glob("*.py")} - {"__init__", "job"} == stages
+    assert {p.stem for p in (root / "src/snakesfm/config").glob("*.py")} - {
+        "__init__",
+        "base",
+        "configuration",
+    } == stages
+    assert stages <= set(configuration_class().model_fields)
+
+
+@pytest.mark.parametrize("stage", STAGES)
+def test_rule_writes_to_the_folder_of_its_name_and_runs_its_script(root: Path, stage: str) -> None:
+    text = rule_texts(root)[stage]
+    output = re.search(r"output:\n(.*?)log:", text, re.S)[1]
+    assert set(re.findall(r'artifact\(\s*"(\w+)"', output)) == {stage}
+    assert re.findall(r"scripts/(\w+)\.py", text) == [stage]
+    for directive in ("log_file", "benchmark_file", "job_params"):
+        assert re.findall(rf'{directive}\("(\w+)"', text) == [stage]
+
+
+@pytest.mark.parametrize("stage", STAGES)
+def test_script_is_thin_and_stage_has_run(root: Path, stage: str) -> None:
+    script = (root / "scripts" / f"{stage}.py").read_text()
+    assert f'run_job("{stage}", snakemake)' in script
+    assert len(script.splitlines()) <= 10
+    tree = ast.parse((root / "src/snakesfm/stages" / f"{stage}.py").read_text())
+    assert "run" in {node.name for node in tree.body if isinstance(node, ast.FunctionDef)}
+    assert options_class(stage).stage_version >= 1
+
+
+def domain_files() -> list[Path]:
+    package = Path(__file__).resolve().parents[2] / "src" / "snakesfm"
+    return [
+        file
+        for file in sorted(package.rglob("*.py"))
+        if file.parent != package and file.relative_to(package).parts[0] not in NO_DOMAIN
+    ]
+
+
+@pytest.mark.parametrize("file", domain_files(), ids=lambda p: f"{p.parent.name}/{p.name}")
+def test_domains_import_no_stage_no_artifact_and_no_workflow(file: Path) -> None:
+    imported = set()
+    for node in ast.walk(ast.parse(file.read_text())):
+        if isinstance(node, ast.Import):
+            imported |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            imported.add(node.module)
+    wrong = {name for name in imported for ban in DOMAIN_MAY_IMPORT_NOT if (name + ".").startswith(ban + ".")}
+    assert not wrong
+
+
+def test_snakefile_is_a_table_of_contents(root: Path) -> None:
+    lines = (root / "Snakefile").read_text().splitlines()
+    assert len(lines) <= 60
+    assert not [line for line in lines if re.match(r"\s*(def|lambda)\b", line)]
+
+
+def test_no_source_file_is_too_long(root: Path) -> None:
+    long = {
+        str(file.relative_to(root)): count
+        for file in sorted((root / "src").rglob("*.py"))
+        if (count := len(file.read_text().splitlines())) > 450
+    }
+    assert not long

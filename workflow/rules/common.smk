@@ -1,0 +1,97 @@
+# Names, input functions and the start and end of a run. No rules here.
+
+import re
+
+from snakemake.exceptions import WorkflowError
+
+from snakesfm.config.configuration import SCENE_PATTERN
+from snakesfm.errors import SnakesfmError
+from snakesfm.plan import Plan, tile_names
+from snakesfm.run import Run
+
+try:
+    PLAN = Plan(config)
+except SnakesfmError as error:
+    raise WorkflowError(str(error)) from None
+RUN = Run(PLAN)
+
+
+wildcard_constraints:
+    scene=SCENE_PATTERN,
+    block=r"\d+",
+    tile=r"\d+-\d+",
+
+
+OUTPUT = str(PLAN.output)
+
+
+def artifact(stage, file):
+    """The pattern of a stage's file in every scene."""
+    return f"{OUTPUT}/{{scene}}/{stage}/{file}"
+
+
+def log_file(stage, part="job"):
+    """The pattern of a job's log."""
+    return f"{OUTPUT}/{{scene}}/logs/{stage}/{part}.log"
+
+
+def benchmark_file(stage, part="job"):
+    """The pattern of a job's time and memory record."""
+    return f"{OUTPUT}/{{scene}}/benchmarks/{stage}/{part}.tsv"
+
+
+def files_of(stage, parts):
+    """An input function: a stage's files for 'blocks' or 'tiles', all of the scene's."""
+
+    def list_files(wildcards):
+        return PLAN.scenes[wildcards.scene].files(stage, parts)
+
+    return list_files
+
+
+def tile_features(wildcards):
+    """The one or two feature blocks that a tile reads."""
+    return PLAN.scenes[wildcards.scene].tile_features(wildcards.tile)
+
+
+def global_descriptors(wildcards):
+    """The global descriptors of all blocks where pairs are retrieved, else nothing."""
+    return PLAN.scenes[wildcards.scene].global_descriptors()
+
+
+def any_of(names):
+    """A wildcard constraint that matches just these names."""
+    return "|".join(re.escape(name) for name in names)
+
+
+def job_params(stage):
+    """A params function: the canonical JSON of all that determines a job's result beside its inputs."""
+
+    def render(wildcards):
+        scene = PLAN.scenes[wildcards.scene]
+        return scene.params(stage, wildcards, workflow.is_main_process)
+
+    return render
+
+
+def final_files():
+    """What a run makes: the report of every scene, and so everything else."""
+    return [path for scene in PLAN.scenes.values() for path in scene.final_files()]
+
+
+def start_run():
+    """Lock the output folder for this run, and say what is about to be done."""
+    try:
+        RUN.start()
+    except SnakesfmError as error:
+        raise WorkflowError(str(error)) from None
+
+
+def finish_run(log):
+    """One line per scene about its model."""
+    RUN.finish()
+
+
+def fail_run(log):
+    """One line per scene that ended well, and one per error."""
+    RUN.fail()

@@ -1,0 +1,70 @@
+# Local and global descriptors, and the pairs of images worth matching.
+
+
+rule extract_features:
+    input:
+        index=artifact("index_images", "index.h5"),
+    output:
+        artifact("extract_features", "{block}.h5"),
+    log:
+        log_file("extract_features", "{block}"),
+    benchmark:
+        benchmark_file("extract_features", "{block}")
+    params:
+        job=job_params("extract_features"),
+    script:
+        "../../scripts/extract_features.py"
+
+
+rule learn_vocabulary:
+    input:
+        features=files_of("extract_features", "blocks"),
+    output:
+        artifact("learn_vocabulary", "vocabulary.h5"),
+    log:
+        log_file("learn_vocabulary"),
+    benchmark:
+        benchmark_file("learn_vocabulary")
+    params:
+        job=job_params("learn_vocabulary"),
+    script:
+        "../../scripts/learn_vocabulary.py"
+
+
+rule describe_images:
+    input:
+        features=artifact("extract_features", "{block}.h5"),
+        vocabulary=artifact("learn_vocabulary", "vocabulary.h5"),
+    output:
+        artifact("describe_images", "{block}.h5"),
+    log:
+        log_file("describe_images", "{block}"),
+    benchmark:
+        benchmark_file("describe_images", "{block}")
+    params:
+        job=job_params("describe_images"),
+    script:
+        "../../scripts/describe_images.py"
+
+
+# the outputs of a rule cannot depend on the scene, so scenes with another number of blocks have their own rule
+for blocks, scenes in PLAN.scenes_by_blocks().items():
+
+    rule:
+        name:
+            PLAN.select_pairs_rule(blocks)
+        input:
+            index=artifact("index_images", "index.h5"),
+            descriptors=global_descriptors,
+        output:
+            [artifact("select_pairs", f"{tile}.h5") for tile in tile_names(blocks)],
+        log:
+            log_file("select_pairs"),
+        benchmark:
+            benchmark_file("select_pairs")
+        wildcard_constraints:
+            scene=any_of(scenes),
+        params:
+            job=job_params("select_pairs"),
+        script:
+            "../../scripts/select_pairs.py"

@@ -1,0 +1,15 @@
+# From image files to an index.
+
+
+rule index_images:
+    output:
+        artifact("index_images", "index.h5"),
+    log:
+        log_file("index_images"),
+    benchmark:
+        benchmark_file("index_images")
+    threads: 2
+    params:
+        job=job_params("index_images"),
+    script:
+        "../../scripts/index_images.py"

@@ -1,0 +1,129 @@
+# From relative poses to the adjusted model, one job per stage.
+
+
+rule build_view_graph:
+    input:
+        index=artifact("index_images", "index.h5"),
+        geometries=files_of("estimate_two_view", "tiles"),
+    output:
+        artifact("build_view_graph", "graph.h5"),
+    log:
+        log_file("build_view_graph"),
+    benchmark:
+        benchmark_file("build_view_graph")
+    params:
+        job=job_params("build_view_graph"),
+    script:
+        "../../scripts/build_view_graph.py"
+
+
+rule filter_view_graph:
+    input:
+        index=artifact("index_images", "index.h5"),
+        graph=artifact("build_view_graph", "graph.h5"),
+    output:
+        artifact("filter_view_graph", "graph.h5"),
+    log:
+        log_file("filter_view_graph"),
+    benchmark:
+        benchmark_file("filter_view_graph")
+    params:
+        job=job_params("filter_view_graph"),
+    script:
+        "../../scripts/filter_view_graph.py"
+
+
+rule average_rotations:
+    input:
+        index=artifact("index_images", "index.h5"),
+        graph=artifact("filter_view_graph", "graph.h5"),
+    output:
+        artifact("average_rotations", "rotations.h5"),
+    log:
+        log_file("average_rotations"),
+    benchmark:
+        benchmark_file("average_rotations")
+    params:
+        job=job_params("average_rotations"),
+    script:
+        "../../scripts/average_rotations.py"
+
+
+rule build_tracks:
+    input:
+        index=artifact("index_images", "index.h5"),
+        features=files_of("extract_features", "blocks"),
+        geometries=files_of("estimate_two_view", "tiles"),
+        graph=artifact("filter_view_graph", "graph.h5"),
+        rotations=artifact("average_rotations", "rotations.h5"),
+    output:
+        artifact("build_tracks", "tracks.h5"),
+    log:
+        log_file("build_tracks"),
+    benchmark:
+        benchmark_file("build_tracks")
+    params:
+        job=job_params("build_tracks"),
+    script:
+        "../../scripts/build_tracks.py"
+
+
+rule average_translations:
+    input:
+        index=artifact("index_images", "index.h5"),
+        cameras=artifact("calibrate_cameras", "cameras.h5"),
+        graph=artifact("filter_view_graph", "graph.h5"),
+        rotations=artifact("average_rotations", "rotations.h5"),
+        tracks=artifact("build_tracks", "tracks.h5"),
+    output:
+        artifact("average_translations", "centers.h5"),
+    log:
+        log_file("average_translations"),
+    benchmark:
+        benchmark_file("average_translations")
+    params:
+        job=job_params("average_translations"),
+    script:
+        "../../scripts/average_translations.py"
+
+
+rule triangulate_tracks:
+    input:
+        index=artifact("index_images", "index.h5"),
+        cameras=artifact("calibrate_cameras", "cameras.h5"),
+        rotations=artifact("average_rotations", "rotations.h5"),
+        centers=artifact("average_translations", "centers.h5"),
+        tracks=artifact("build_tracks", "tracks.h5"),
+    output:
+        artifact("triangulate_tracks", "points.h5"),
+    log:
+        log_file("triangulate_tracks"),
+    benchmark:
+        benchmark_file("triangulate_tracks")
+    params:
+        job=job_params("triangulate_tracks"),
+    script:
+        "../../scripts/triangulate_tracks.py"
+
+
+rule adjust_bundle:
+    input:
+        index=artifact("index_images", "index.h5"),
+        cameras=artifact("calibrate_cameras", "cameras.h5"),
+        features=files_of("extract_features", "blocks"),
+        geometries=files_of("estimate_two_view", "tiles"),
+        graph=artifact("filter_view_graph", "graph.h5"),
+        rotations=artifact("average_rotations", "rotations.h5"),
+        centers=artifact("average_translations", "centers.h5"),
+        points=artifact("triangulate_tracks", "points.h5"),
+    output:
+        artifact("adjust_bundle", "reconstruction.h5"),
+    log:
+        log_file("adjust_bundle"),
+    benchmark:
+        benchmark_file("adjust_bundle")
+    threads: 2
+    params:
+        job=job_params("adjust_bundle"),
+    script:
+        "../../scripts/adjust_bundle.py"

@@ -1,0 +1,24 @@
+# What a person reads.
+
+
+rule render_report:
+    input:
+        index=artifact("index_images", "index.h5"),
+        geometries=files_of("estimate_two_view", "tiles"),
+        graph=artifact("filter_view_graph", "graph.h5"),
+        rotations=artifact("average_rotations", "rotations.h5"),
+        tracks=artifact("build_tracks", "tracks.h5"),
+        points=artifact("triangulate_tracks", "points.h5"),
+        reconstruction=artifact("adjust_bundle", "reconstruction.h5"),
+        metrics=artifact("evaluate_model", "metrics.json"),
+        summary=artifact("export_model", "summary.json"),
+    output:
+        artifact("render_report", "index.html"),
+    log:
+        log_file("render_report"),
+    benchmark:
+        benchmark_file("render_report")
+    params:
+        job=job_params("render_report"),
+    script:
+        "../../scripts/render_report.py"
