@@ -52,9 +52,14 @@ class ScenePlan:
                 f"The image folder '{images}' does not exist: {hint}say which folder with "
                 "--config images=PATH."
             )
+        if self.folder.resolve().is_relative_to(images.resolve()):
+            raise ConfigError(
+                f"The output folder '{self.folder.parent}' lies inside the image folder '{images}', so its "
+                "pictures would be taken for photographs: give another output=DIR."
+            )
         if count_images(images, 1) == 0:
             raise ConfigError(
-                f"The folder '{images}' holds no JPEG, PNG, TIFF or WebP image: "
+                f"The folder '{images}' holds no JPEG, PNG, TIFF, WebP or BMP image: "
                 "say with --config images=PATH which folder does."
             )
         for key in ("reference", "cameras", "pairs"):
@@ -85,7 +90,7 @@ class ScenePlan:
     def select_pairs(self) -> SelectPairsOptions:
         """How pairs are chosen, with 'auto' resolved."""
         options: SelectPairsOptions = self.configuration.select_pairs
-        return options.resolve(self.image_count) if options.method == "auto" else options
+        return options.resolve(self.image_count, self.inputs.pairs)
 
     def options(self, stage: str) -> StageOptions:
         """The options of a stage in this scene."""

@@ -4,7 +4,6 @@ import re
 
 from snakemake.exceptions import WorkflowError
 
-from snakesfm.config.configuration import SCENE_PATTERN
 from snakesfm.errors import SnakesfmError
 from snakesfm.plan import Plan, tile_names
 from snakesfm.run import Run
@@ -17,7 +16,7 @@ RUN = Run(PLAN)
 
 
 wildcard_constraints:
-    scene=SCENE_PATTERN,
+    scene="[^/.][^/]*",
     block=r"\d+",
     tile=r"\d+-\d+",
 

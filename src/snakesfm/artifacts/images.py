@@ -13,12 +13,14 @@ class ImageIndex(Artifact):
     kind: ClassVar[str] = "image_index"
 
     names: Array = column("(N)", "str", "POSIX path relative to the image folder, sorted")
-    sizes: Array = column("(N,2)", "int32", "width and height in pixels as decoded and oriented")
+    sizes: Array = column("(N,2)", "int32", "width and height in pixels as stored in the file")
     sha256: Array = column("(N)", "str", "SHA-256 of the file, hexadecimal")
     blocks: Array = column("(N)", "int32", "block that the image is dealt into")
     camera_ids: Array = column("(N)", "int32", "row of the image's camera in the camera columns")
-    orientations: Array = column("(N)", "int32", "EXIF orientation 1..8 that was undone")
-    focal_exif_px: Array = column("(N)", "float64", "focal length from EXIF in pixels, NaN if none")
+    orientations: Array = column("(N)", "int32", "EXIF orientation 1..8, not applied: pixels are as stored")
+    focal_exif_px: Array = column(
+        "(N)", "float64", "focal length from EXIF in pixels, NaN if none or cropped"
+    )
     gps: Array = column("(N,3)", "float64", "EXIF latitude, longitude (deg), altitude (m), NaN if none")
     duplicate_of: Array = column("(N)", "int32", "first image with the same bytes, -1 if none")
     camera_models: Array = column("(C)", "str", "COLMAP camera model name")
@@ -38,8 +40,6 @@ class CalibratedCameras(Artifact):
     models: Array = column("(C)", "str", "COLMAP camera model name")
     sizes: Array = column("(C,2)", "int32", "width and height in pixels")
     params: Array = column("(C,12)", "float64", "COLMAP parameters in pixels, padded with NaN")
-    sources: Array = column(
-        "(C)", "str", "where the focal length is from: given, exif, estimated, default"
-    )
+    sources: Array = column("(C)", "str", "where the focal length is from: given, exif, estimated, default")
     focal_sigma: Array = column("(C)", "float64", "relative standard deviation of the focal, NaN unknown")
     pair_counts: Array = column("(C)", "int32", "pairs whose fundamental matrix voted on the focal")

@@ -13,8 +13,18 @@ REJECTIONS = (
     "too_few_inliers",
     "low_inlier_ratio",
     "indeterminate",
+    "not_significant",
+    "ambiguous",
 )
-EDGE_LABELS = ("kept", "cycle_min", "cycle_median", "component", "rotation_residual")
+EDGE_LABELS = (
+    "kept",
+    "cycle_min",
+    "cycle_median",
+    "component",
+    "rotation_residual",
+    "cycle_message",
+    "cluster_vote",
+)
 
 
 @dataclass(frozen=True)

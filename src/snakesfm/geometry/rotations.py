@@ -1,16 +1,20 @@
-"""Rotations as (..., 3, 3) matrices, vectorised."""
+"""Rotations as (..., 3, 3) matrices, vectorised.
+
+scipy is imported where it is needed: it is a third of the start-up of stages that only compare directions.
+"""
 
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 Array = NDArray[Any]
 
 
 def exp_so3(vectors: Array) -> Array:
     """Rotation vectors (..., 3) in radians to matrices (..., 3, 3)."""
+    from scipy.spatial.transform import Rotation
+
     vectors = np.asarray(vectors, dtype=np.float64)
     flat = Rotation.from_rotvec(vectors.reshape(-1, 3)).as_matrix()
     return flat.reshape(*vectors.shape[:-1], 3, 3)
@@ -18,6 +22,8 @@ def exp_so3(vectors: Array) -> Array:
 
 def log_so3(rotations: Array) -> Array:
     """Matrices (..., 3, 3) to rotation vectors (..., 3) in radians."""
+    from scipy.spatial.transform import Rotation
+
     rotations = np.asarray(rotations, dtype=np.float64)
     flat = Rotation.from_matrix(rotations.reshape(-1, 3, 3)).as_rotvec()
     return flat.reshape(*rotations.shape[:-2], 3)

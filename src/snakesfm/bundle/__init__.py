@@ -1,0 +1,1 @@
+"""Bundle adjustment, and what is done to the model between its rounds."""

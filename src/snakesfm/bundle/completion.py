@@ -1,0 +1,83 @@
+"""More observations for the model: tracks completed and merged, points made of left-out matches."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import cv2  # noqa: F401 - must be loaded before pycolmap, whose PNG library clashes otherwise
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from snakesfm.tracks.canonical import canonical_keypoints
+
+Array = NDArray[Any]
+
+
+def correspondence_graph(
+    keypoints: Sequence[Array], pairs: Array, offsets: Array, matches: Array
+) -> pycolmap.CorrespondenceGraph:
+    """The inlier matches for pycolmap's triangulator.
+
+    Parameters
+    ----------
+    keypoints : per image (K_i,2), pixels; keypoints at one place count as the first of them.
+    pairs : (P,2) int, images i < j.
+    offsets : (P+1,) int64, rows ``offsets[k]:offsets[k+1]`` of ``matches`` belong to pair k.
+    matches : (M,2) int, keypoint rows in image i and in image j.
+    """
+    graph = pycolmap.CorrespondenceGraph()
+    canonical = [canonical_keypoints(points) for points in keypoints]
+    for row, points in enumerate(keypoints):
+        graph.add_image(row + 1, len(points))
+    for row, (i, j) in enumerate(pairs.tolist()):
+        found = matches[offsets[row] : offsets[row + 1]]
+        found = np.unique(np.c_[canonical[i][found[:, 0]], canonical[j][found[:, 1]]], axis=0)
+        geometry = pycolmap.TwoViewGeometry()
+        geometry.config = pycolmap.TwoViewGeometryConfiguration.CALIBRATED
+        geometry.inlier_matches = found.astype(np.uint32)
+        graph.add_two_view_geometry(i + 1, j + 1, geometry)
+    graph.finalize()
+    return graph
+
+
+class TrackCompleter:
+    """pycolmap's incremental triangulator on one reconstruction.
+
+    Parameters
+    ----------
+    reconstruction, graph : kept alive as long as this object.
+    max_error_px : largest reprojection error of an added observation.
+    min_angle_deg : smallest triangulation angle of a new point.
+    seed : of the robust estimation.
+    """
+
+    def __init__(
+        self,
+        reconstruction: pycolmap.Reconstruction,
+        graph: pycolmap.CorrespondenceGraph,
+        max_error_px: float,
+        min_angle_deg: float,
+        seed: int,
+    ) -> None:
+        self.reconstruction = reconstruction
+        self.graph = graph
+        self.options = pycolmap.IncrementalTriangulatorOptions()
+        self.options.complete_max_reproj_error = max_error_px
+        self.options.merge_max_reproj_error = max_error_px
+        self.options.min_angle = min_angle_deg
+        self.options.ignore_two_view_tracks = True
+        self.options.random_seed = seed
+
+    def __call__(self, images: Sequence[int] | None = None) -> int:
+        """Complete and merge all tracks, and triangulate the left-out matches of ``images`` (all if None).
+
+        Returns the number of observations that were added.
+        """
+        before = self.reconstruction.compute_num_observations()
+        triangulator = pycolmap.IncrementalTriangulator(self.graph, self.reconstruction)
+        registered = sorted(self.reconstruction.reg_image_ids())
+        for image_id in registered if images is None else [row + 1 for row in images]:
+            triangulator.triangulate_image(self.options, image_id)
+        triangulator.complete_all_tracks(self.options)
+        triangulator.merge_all_tracks(self.options)
+        return int(self.reconstruction.compute_num_observations() - before)

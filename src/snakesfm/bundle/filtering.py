@@ -1,0 +1,77 @@
+"""What is taken out of the model between rounds: observations, points, images, and intrinsics gone wild."""
+
+from collections.abc import Sequence
+
+import cv2  # noqa: F401 - must be loaded before pycolmap, whose PNG library clashes otherwise
+import pycolmap
+
+from snakesfm.geometry.camera import Camera
+
+
+def filter_observations(
+    reconstruction: pycolmap.Reconstruction, max_error_px: float, min_angle_deg: float, min_length: int = 2
+) -> int:
+    """Drop observations with large errors, points with nearly parallel rays, and points too short.
+
+    Parameters
+    ----------
+    reconstruction : changed in place.
+    max_error_px : observations with larger errors, or behind the camera, are dropped one by one.
+    min_angle_deg : points whose widest rays meet at less are dropped.
+    min_length : observations that a point must have.
+
+    Returns
+    -------
+    How many observations were dropped.
+    """
+    before = reconstruction.compute_num_observations()
+    pycolmap.ObservationManager(reconstruction).filter_all_points3D(max_error_px, min_angle_deg)
+    drop_short_tracks(reconstruction, min_length)
+    return int(before - reconstruction.compute_num_observations())
+
+
+def drop_short_tracks(reconstruction: pycolmap.Reconstruction, min_length: int) -> None:
+    """Drop points with fewer than ``min_length`` observations."""
+    if min_length > 2:
+        pycolmap.ObservationManager(reconstruction).filter_points3D_with_short_tracks(min_length)
+
+
+def deregister_weak_images(reconstruction: pycolmap.Reconstruction, min_observations: int) -> list[int]:
+    """Take out images with fewer observations, the weakest first; the rows that were taken out."""
+    taken: list[int] = []
+    while True:
+        counts = {i: reconstruction.image(i).num_points3D for i in reconstruction.reg_image_ids()}
+        if not counts:
+            return taken
+        weakest = min(counts, key=lambda i: (counts[i], i))
+        if counts[weakest] >= min_observations:
+            return taken
+        reconstruction.deregister_frame(reconstruction.image(weakest).frame_id)
+        taken.append(weakest - 1)
+
+
+def reset_wild_cameras(
+    reconstruction: pycolmap.Reconstruction,
+    cameras: Sequence[Camera],
+    max_focal_change: float,
+    max_distortion: float,
+) -> list[int]:
+    """Give cameras whose intrinsics left what is plausible their first ones back; the rows of these.
+
+    Parameters
+    ----------
+    reconstruction : changed in place.
+    cameras : the intrinsics before any adjustment.
+    max_focal_change : factor up or down.
+    max_distortion : largest absolute value of a distortion parameter.
+    """
+    wild = []
+    for row, start in enumerate(cameras):
+        camera = reconstruction.camera(row + 1)
+        change = camera.mean_focal_length() / start.focal_px
+        extra = [abs(camera.params[k]) for k in camera.extra_params_idxs()]
+        allowed = max(max_distortion, *(abs(p) for p in start.params[-len(extra) :])) if extra else 0.0
+        if not 1 / max_focal_change <= change <= max_focal_change or max(extra, default=0.0) > allowed:
+            camera.params = list(start.params)
+            wild.append(row)
+    return wild

@@ -1,0 +1,42 @@
+"""What a solver of bundle adjustment is given and gives back."""
+
+from dataclasses import dataclass
+from typing import Any, Literal, Protocol
+
+Loss = Literal["huber", "cauchy", "squared"]
+
+
+@dataclass(frozen=True)
+class SolverSettings:
+    """How one pass is solved.
+
+    Parameters
+    ----------
+    loss, loss_scale_px : robust loss on the norm of each reprojection error, and where it sets in.
+    constant_cameras : ids of cameras whose intrinsics are held.
+    refine_focal, refine_distortion : which intrinsics of the others are free; principal points never are.
+    constant_rotations : hold all rotations.
+    max_iterations, function_tolerance : when the solver stops.
+    threads : of the solver.
+    """
+
+    loss: Loss = "cauchy"
+    loss_scale_px: float = 1.0
+    constant_cameras: frozenset[int] = frozenset()
+    refine_focal: bool = True
+    refine_distortion: bool = True
+    constant_rotations: bool = False
+    max_iterations: int = 100
+    function_tolerance: float = 1e-6
+    threads: int = 1
+
+
+class BundleAdjuster(Protocol):
+    """Adjusts the registered images, the points and the cameras of a ``pycolmap.Reconstruction`` in place.
+
+    Returns the robust cost, half the sum of the losses in px^2, before and after.
+    """
+
+    def __call__(self, reconstruction: Any, settings: SolverSettings) -> tuple[float, float]:
+        """Solve one pass."""
+        ...

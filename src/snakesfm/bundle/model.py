@@ -1,0 +1,152 @@
+"""The model as arrays, and as a ``pycolmap.Reconstruction`` while it is worked on.
+
+Ids of cameras, images and frames in the reconstruction are rows plus one.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import cv2  # noqa: F401 - must be loaded before pycolmap, whose PNG library clashes otherwise
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from snakesfm.geometry.camera import Camera
+from snakesfm.geometry.poses import to_rigid3d
+
+Array = NDArray[Any]
+
+
+@dataclass(frozen=True)
+class BundleModel:
+    """Cameras, poses, points and observations.
+
+    Parameters
+    ----------
+    cameras : intrinsics (C).
+    camera_ids : (N,) int, camera of each image.
+    rotations, translations : (N,3,3) and (N,3) float64 cam_from_world, NaN where not registered.
+    points : (T,3) float64 in the world.
+    offsets : (T+1,) int64, rows ``offsets[k]:offsets[k+1]`` of the next two belong to point k.
+    image_ids, keypoint_ids : (L,) int32, row of the image, and of the keypoint in it.
+    """
+
+    cameras: tuple[Camera, ...]
+    camera_ids: Array
+    rotations: Array
+    translations: Array
+    points: Array
+    offsets: Array
+    image_ids: Array
+    keypoint_ids: Array
+
+
+def to_reconstruction(
+    model: BundleModel, keypoints: Sequence[Array], names: Sequence[str]
+) -> pycolmap.Reconstruction:
+    """The model for pycolmap.
+
+    Parameters
+    ----------
+    model : observations by images that are not registered are left out.
+    keypoints : per image (K_i,2), pixels.
+    names : of the images.
+    """
+    reconstruction = pycolmap.Reconstruction()
+    for row, camera in enumerate(model.cameras):
+        reconstruction.add_camera_with_trivial_rig(camera.to_pycolmap(row + 1))
+    posed = np.isfinite(model.rotations[:, 0, 0]) & np.isfinite(model.translations[:, 0])
+    for row, name in enumerate(names):
+        image = pycolmap.Image(
+            name=str(name),
+            camera_id=int(model.camera_ids[row]) + 1,
+            image_id=row + 1,
+            keypoints=keypoints[row].astype(np.float64),
+        )
+        if posed[row]:
+            pose = to_rigid3d(model.rotations[row], model.translations[row])
+            reconstruction.add_image_with_trivial_frame(image, pose)
+        else:
+            reconstruction.add_image_with_trivial_frame(image)
+    images, rows = (model.image_ids + 1).tolist(), model.keypoint_ids.tolist()
+    usable, offsets = posed[model.image_ids].tolist(), model.offsets.tolist()
+    for point, start, end in zip(model.points, offsets[:-1], offsets[1:], strict=True):
+        track = [pycolmap.TrackElement(images[k], rows[k]) for k in range(start, end) if usable[k]]
+        if len(track) >= 2:
+            reconstruction.add_point3D(point, pycolmap.Track(track))
+    return reconstruction
+
+
+def from_reconstruction(reconstruction: pycolmap.Reconstruction, model: BundleModel) -> BundleModel:
+    """The reconstruction as arrays; points sorted by their first observation, observations by image.
+
+    Parameters
+    ----------
+    reconstruction : what :func:`to_reconstruction` made of ``model``, changed since.
+    model : gives the cameras' sources and which camera took each image.
+    """
+    cameras = tuple(
+        replace(camera, params=tuple(float(p) for p in reconstruction.camera(row + 1).params))
+        for row, camera in enumerate(model.cameras)
+    )
+    rotations = np.full((len(model.camera_ids), 3, 3), np.nan)
+    translations = np.full((len(model.camera_ids), 3), np.nan)
+    for image_id in reconstruction.reg_image_ids():
+        pose = reconstruction.image(image_id).cam_from_world()
+        rotations[image_id - 1] = pose.rotation.matrix()
+        translations[image_id - 1] = pose.translation
+    points, point_rows, images, rows = observations_of(reconstruction)
+    order = np.lexsort((rows, images, point_rows))
+    point_rows, images, rows = point_rows[order], images[order], rows[order]
+    offsets = np.searchsorted(point_rows, np.arange(len(points) + 1))
+    rank = np.lexsort((rows[offsets[:-1]], images[offsets[:-1]]))
+    lengths = np.diff(offsets)[rank]
+    sorted_offsets = np.r_[0, np.cumsum(lengths)].astype(np.int64)
+    take = np.repeat(offsets[:-1][rank] - sorted_offsets[:-1], lengths) + np.arange(len(rows))
+    return BundleModel(
+        cameras,
+        model.camera_ids,
+        rotations,
+        translations,
+        points[rank],
+        sorted_offsets,
+        images[take].astype(np.int32),
+        rows[take].astype(np.int32),
+    )
+
+
+def observations_of(reconstruction: pycolmap.Reconstruction) -> tuple[Array, Array, Array, Array]:
+    """Points (T,3) and, per observation, the rows (L,) of its point, image and keypoint."""
+    points3d = reconstruction.points3D
+    ids = sorted(points3d)
+    positions = np.array([points3d[key].xyz for key in ids], dtype=np.float64).reshape(-1, 3)
+    seen = [
+        (row, element.image_id - 1, element.point2D_idx)
+        for row, key in enumerate(ids)
+        for element in points3d[key].track.elements
+    ]
+    flat = np.array(seen, dtype=np.int64).reshape(-1, 3)
+    return positions, flat[:, 0], flat[:, 1], flat[:, 2]
+
+
+def reprojection_errors(model: BundleModel, keypoints: Array) -> Array:
+    """Distance (L,) in pixels of each observation from its projected point; inf behind the camera.
+
+    Parameters
+    ----------
+    model : the model.
+    keypoints : (L,2) pixels of the observations.
+    """
+    point_of = np.repeat(np.arange(len(model.points)), np.diff(model.offsets))
+    rotations = model.rotations[model.image_ids]
+    in_camera = np.einsum("lij,lj->li", rotations, model.points[point_of])
+    in_camera += model.translations[model.image_ids]
+    errors = np.full(len(point_of), np.inf)
+    camera_of = model.camera_ids[model.image_ids]
+    for camera in np.unique(camera_of).tolist():
+        rows = np.nonzero((camera_of == camera) & (in_camera[:, 2] > 0))[0]
+        if len(rows):
+            projected = model.cameras[camera].to_pycolmap().img_from_cam(in_camera[rows])
+            errors[rows] = np.linalg.norm(np.asarray(projected).reshape(-1, 2) - keypoints[rows], axis=1)
+    return errors

@@ -1,0 +1,173 @@
+"""The chained rounds of bundle adjustment."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import cv2  # noqa: F401 - must be loaded before pycolmap, whose PNG library clashes otherwise
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from snakesfm.bundle.completion import TrackCompleter
+from snakesfm.bundle.filtering import (
+    deregister_weak_images,
+    drop_short_tracks,
+    filter_observations,
+    reset_wild_cameras,
+)
+from snakesfm.bundle.interface import BundleAdjuster, SolverSettings
+from snakesfm.bundle.registration import register_left_out
+from snakesfm.geometry.camera import Camera
+
+Array = NDArray[Any]
+
+
+@dataclass(frozen=True)
+class RoundSettings:
+    """What is done in and between the rounds; see the options of adjust_bundle for each."""
+
+    solver: Literal["ceres", "gtsam"] = "ceres"
+    thresholds_px: tuple[float, ...] = (10.0, 5.0, 3.0)
+    rotations_first: bool = True
+    max_focal_change: float = 3.0
+    max_distortion: float = 1.0
+    complete_tracks: bool = True
+    complete_error_px: float = 4.0
+    register_images: bool = True
+    register_min_inliers: int = 15
+    register_min_ratio: float = 0.25
+    register_error_px: float = 6.0
+    min_angle_deg: float = 1.0
+    min_track_length: int = 3
+    min_observations: int = 10
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class RoundRecord:
+    """What one round did: robust costs before and after, and the model's size and mean error after it."""
+
+    name: str
+    costs: tuple[float, float]
+    counts: tuple[int, int, int]
+    error_px: float
+
+
+def bundle_adjuster(solver: Literal["ceres", "gtsam"]) -> BundleAdjuster:
+    """The solver of a name."""
+    if solver == "gtsam":
+        from snakesfm.bundle.gtsam_solver import adjust_gtsam
+
+        return adjust_gtsam
+    from snakesfm.bundle.ceres import adjust_ceres
+
+    return adjust_ceres
+
+
+def adjust_rounds(
+    reconstruction: pycolmap.Reconstruction,
+    graph: pycolmap.CorrespondenceGraph,
+    cameras: Sequence[Camera],
+    solving: SolverSettings,
+    settings: RoundSettings,
+    report: Callable[[RoundRecord], None],
+) -> list[RoundRecord]:
+    """Adjust, filter and complete a model in rounds that each start from the result of the one before.
+
+    Parameters
+    ----------
+    reconstruction : changed in place.
+    graph : inlier matches for completion and registration.
+    cameras : the intrinsics at the start.
+    solving : how each pass is solved.
+    settings : what is done in and between the rounds.
+    report : called with each record as soon as it is there.
+    """
+    mapper = _Mapper(reconstruction, graph, cameras, solving, settings, report)
+    if settings.rotations_first:
+        mapper.round("rotations fixed", settings.thresholds_px[0] * 2, constant_rotations=True)
+    for row, threshold in enumerate(settings.thresholds_px):
+        if row and settings.complete_tracks:
+            mapper.completer()
+        mapper.round(f"round {row + 1}", threshold)
+    while settings.register_images and mapper.register():
+        mapper.round("registration", settings.thresholds_px[-1])
+    return mapper.records
+
+
+class _Mapper:
+    """The model and what happens to it."""
+
+    def __init__(
+        self,
+        reconstruction: pycolmap.Reconstruction,
+        graph: pycolmap.CorrespondenceGraph,
+        cameras: Sequence[Camera],
+        solving: SolverSettings,
+        settings: RoundSettings,
+        report: Callable[[RoundRecord], None],
+    ) -> None:
+        self.reconstruction = reconstruction
+        self.graph = graph
+        self.cameras = cameras
+        self.solving = solving
+        self.settings = settings
+        self.report = report
+        self.records: list[RoundRecord] = []
+        self.adjust = bundle_adjuster(settings.solver)
+        self.completer = TrackCompleter(
+            reconstruction, graph, settings.complete_error_px, settings.min_angle_deg, settings.seed
+        )
+
+    def round(self, name: str, threshold_px: float, constant_rotations: bool = False) -> None:
+        """One pass of the solver and the filters after it."""
+        settings, solving = self.settings, replace(self.solving, constant_rotations=constant_rotations)
+        drop_short_tracks(self.reconstruction, settings.min_track_length)
+        costs = self.adjust(self.reconstruction, solving)
+        wild = reset_wild_cameras(
+            self.reconstruction, self.cameras, settings.max_focal_change, settings.max_distortion
+        )
+        if wild:
+            held = self.solving.constant_cameras | {row + 1 for row in wild}
+            self.solving = replace(self.solving, constant_cameras=held)
+            costs = self.adjust(self.reconstruction, replace(solving, constant_cameras=held))
+        filter_observations(
+            self.reconstruction, threshold_px, settings.min_angle_deg, settings.min_track_length
+        )
+        deregister_weak_images(self.reconstruction, settings.min_observations)
+        self.reconstruction.update_point_3d_errors()
+        record = RoundRecord(
+            name,
+            costs,
+            (
+                self.reconstruction.num_reg_images(),
+                self.reconstruction.num_points3D(),
+                self.reconstruction.compute_num_observations(),
+            ),
+            float(self.reconstruction.compute_mean_reprojection_error()),
+        )
+        self.records.append(record)
+        self.report(record)
+
+    def register(self) -> bool:
+        """Register what can be; whether something was."""
+        settings = self.settings
+        done = register_left_out(
+            self.reconstruction,
+            self.graph,
+            settings.register_error_px,
+            settings.register_min_inliers,
+            settings.register_min_ratio,
+            settings.seed,
+        )
+        if done:
+            self.completer(done)
+        return bool(done)
+
+
+def mean_point_errors(errors: Array, offsets: Array) -> Array:
+    """Mean (T,) of flat errors (L,) per point."""
+    if len(offsets) == 1:
+        return np.zeros(0)
+    return np.asarray(np.add.reduceat(errors, offsets[:-1]) / np.diff(offsets))

@@ -1,0 +1,1 @@
+"""Focal lengths from fundamental matrices, before any pose is known."""

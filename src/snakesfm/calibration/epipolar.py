@@ -1,0 +1,83 @@
+"""Epipolar geometry of uncalibrated pairs, and which of them can tell a focal length."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import poselib
+from numpy.typing import NDArray
+
+from snakesfm.two_view.sampson import robust_sigma_px
+
+Array = NDArray[Any]
+MAX_POINTS = 400
+
+
+@dataclass(frozen=True)
+class EpipolarPair:
+    """One pair of images with its fundamental matrix.
+
+    Parameters
+    ----------
+    camera_i, camera_j : rows of the cameras.
+    points_i, points_j : (M,2) float64 inliers in pixels from each principal point, at most 400.
+    F : (3,3), point_j^T F point_i = 0 for the points above, of unit norm.
+    noise_px : robust standard deviation of the inliers' Sampson errors.
+    """
+
+    camera_i: int
+    camera_j: int
+    points_i: Array
+    points_j: Array
+    F: Array
+    noise_px: float
+
+
+def estimate_epipolar_pair(
+    camera_i: int,
+    camera_j: int,
+    points_i: Array,
+    points_j: Array,
+    max_error_px: float,
+    planar_ratio: float,
+    seed: int,
+) -> EpipolarPair | None:
+    """The fundamental matrix of matched points, or None where it is weak or the scene looks planar.
+
+    Parameters
+    ----------
+    points_i, points_j : (M,2) matched points in pixels from each principal point.
+    max_error_px : epipolar error of an inlier; twice this is allowed to a homography.
+    planar_ratio : the pair is refused where a homography explains this share of the inliers.
+    """
+    F, info = poselib.estimate_fundamental(
+        points_i,
+        points_j,
+        {"max_epipolar_error": max_error_px, "min_iterations": 100, "max_iterations": 5000, "seed": seed},
+        {"loss_type": "CAUCHY", "loss_scale": 0.5 * max_error_px},
+    )
+    inliers = np.array(info["inliers"], dtype=bool)
+    if inliers.sum() < max(20, 0.25 * len(inliers)) or not np.isfinite(F).all():
+        return None
+    points_i, points_j = points_i[inliers], points_j[inliers]
+    _, info = poselib.estimate_homography(
+        points_i,
+        points_j,
+        {"max_reproj_error": 2.0 * max_error_px, "min_iterations": 20, "max_iterations": 200, "seed": seed},
+        {},
+    )
+    if np.sum(info["inliers"]) >= planar_ratio * len(points_i):
+        return None
+    if len(points_i) > MAX_POINTS:
+        rows = np.sort(np.random.default_rng(seed).permutation(len(points_i))[:MAX_POINTS])
+        points_i, points_j = points_i[rows], points_j[rows]
+    noise_px = robust_sigma_px(_sampson_errors(F, points_i, points_j), 0.0)
+    return EpipolarPair(camera_i, camera_j, points_i, points_j, F / np.linalg.norm(F), noise_px)
+
+
+def _sampson_errors(F: Array, points_i: Array, points_j: Array) -> Array:
+    lines_j = np.column_stack([points_i, np.ones(len(points_i))]) @ F.T
+    lines_i = np.column_stack([points_j, np.ones(len(points_j))]) @ F
+    algebraic = np.sum(points_j * lines_j[:, :2], axis=1) + lines_j[:, 2]
+    errors: Array = algebraic / np.sqrt(np.sum(lines_i[:, :2] ** 2 + lines_j[:, :2] ** 2, axis=1))
+    return errors

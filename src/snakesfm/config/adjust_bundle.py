@@ -1,0 +1,73 @@
+"""Options of adjust_bundle."""
+
+from typing import ClassVar, Literal
+
+from pydantic import Field
+
+from snakesfm.config.base import StageOptions
+
+
+class AdjustBundleOptions(StageOptions):
+    """How cameras, poses and points are adjusted together."""
+
+    stage_version: ClassVar[int] = 1
+
+    solver: Literal["ceres", "gtsam"] = "ceres"
+    """Least-squares solver: Ceres through pycolmap, or gtsam (slower, fewer camera models)."""
+
+    thresholds_px: tuple[float, ...] = Field(default=(10.0, 5.0, 3.0), min_length=1, max_length=10)
+    """Largest reprojection error of an observation after each of the chained rounds."""
+
+    loss: Literal["huber", "cauchy", "squared"] = "cauchy"
+    """Robust loss of the reprojection errors."""
+
+    loss_scale_px: float = Field(default=1.0, gt=0.0, le=100.0)
+    """Reprojection error from which on the loss grows more slowly."""
+
+    rotations_first: bool = True
+    """Start with a pass that holds the averaged rotations fixed."""
+
+    refine_focal: bool = True
+    """Refine the focal length of cameras that are not fixed."""
+
+    refine_distortion: bool = True
+    """Refine the distortion of cameras that are not fixed."""
+
+    max_focal_change: float = Field(default=3.0, gt=1.0)
+    """Factor by which a refined focal length may change before the camera is reset and held fixed."""
+
+    max_distortion: float = Field(default=1.0, gt=0.0)
+    """Largest distortion parameter before the camera is reset and held fixed."""
+
+    complete_tracks: bool = True
+    """Between rounds, add observations to points, merge points, and make points of left-out matches."""
+
+    complete_error_px: float = Field(default=4.0, gt=0.0)
+    """Largest reprojection error of an observation that completion adds."""
+
+    register_images: bool = True
+    """Register images that averaging left out by their matches to points."""
+
+    register_min_inliers: int = Field(default=15, ge=6)
+    """Points that a newly registered image must agree with."""
+
+    register_min_ratio: float = Field(default=0.25, ge=0.0, le=1.0)
+    """Share of its matched points that a newly registered image must agree with."""
+
+    register_error_px: float = Field(default=6.0, gt=0.0)
+    """Largest reprojection error of an inlier of a registration."""
+
+    min_angle_deg: float = Field(default=1.0, ge=0.0, lt=90.0)
+    """Smallest angle between the rays to a point of the model."""
+
+    min_track_length: int = Field(default=3, ge=2)
+    """Observations that a point must have to take part; 2 where only two images are posed."""
+
+    min_observations: int = Field(default=10, ge=0)
+    """Observations that an image must have to stay registered."""
+
+    max_iterations: int = Field(default=100, ge=1)
+    """Iterations of the solver per pass."""
+
+    function_tolerance: float = Field(default=1e-6, gt=0.0)
+    """Relative decrease of the cost at which a pass ends."""

@@ -1,0 +1,23 @@
+"""Options of average_rotations."""
+
+from typing import Literal
+
+from pydantic import Field
+
+from snakesfm.config.base import StageOptions
+
+
+class AverageRotationsOptions(StageOptions):
+    """Options of averaging relative rotations to absolute ones."""
+
+    method: Literal["two_stage", "irls", "shonan"] = "two_stage"
+    """Averager: robust pass and covariance-weighted refinement, L1 and IRLS only, or Shonan averaging."""
+
+    max_residual_deg: float = Field(default=10.0, gt=0, le=180)
+    """Edges are refused that differ from the averaged rotations by more degrees than this."""
+
+    min_residual_deg: float = Field(default=5.0, ge=0, le=180)
+    """The limit adapts to the residuals of the scene, but not below so many degrees."""
+
+    passes: int = Field(default=2, ge=1, le=5)
+    """How often the rotations are averaged; edges are refused by their residuals after each time."""

@@ -1,0 +1,212 @@
+"""The metrics of a model: against reference poses, and those that need no truth."""
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import PurePosixPath
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from snakesfm.evaluation.alignment import Similarity, align_poses
+from snakesfm.evaluation.pose_errors import (
+    FAILED_DEG,
+    chordal_angle_deg,
+    pose_auc,
+    relative_pose_errors,
+)
+from snakesfm.geometry.poses import center_of
+from snakesfm.geometry.rotations import angle_between
+
+Array = NDArray[Any]
+Metrics = dict[str, float | int | None]
+RELATIVE_THRESHOLDS_DEG = (1.0, 3.0, 5.0, 10.0, 20.0)
+GLOBAL_THRESHOLDS_DEG = (1.0, 2.5, 5.0, 10.0, 20.0)
+MIN_BASELINE_RATIO = 1e-6
+
+
+@dataclass(frozen=True)
+class Poses:
+    """Named cam_from_world poses: names, rotations (n,3,3), translations (n,3); NaN if not registered."""
+
+    names: Sequence[str]
+    rotations: Array
+    translations: Array
+
+    @property
+    def registered(self) -> Array:
+        """Which images have a pose, (n,) bool."""
+        rotations, translations = np.isfinite(self.rotations), np.isfinite(self.translations)
+        return np.asarray(rotations.all(axis=(1, 2)) & translations.all(axis=1))
+
+
+@dataclass(frozen=True)
+class PoseEvaluation:
+    """Metrics of a model's poses, and the errors of every scored image.
+
+    ``names`` are those of the scored reference images; ``rotation_deg``, ``position`` (reference units) and
+    ``direction_deg`` (angle between the position vectors from the reference's origin) are NaN where the
+    image is not registered. ``reference_from_model`` is None where no scored image is registered.
+    """
+
+    metrics: Metrics
+    names: list[str] = field(default_factory=list)
+    rotation_deg: Array = field(default_factory=lambda: np.zeros(0))
+    position: Array = field(default_factory=lambda: np.zeros(0))
+    direction_deg: Array = field(default_factory=lambda: np.zeros(0))
+    reference_from_model: Similarity | None = None
+
+
+def match_names(names: Sequence[str], reference_names: Sequence[str]) -> Array:
+    """For each reference image the row of the same image in ``names``, -1 where there is none.
+
+    Relative paths decide; where a path is in no other list, the file name alone does if it is unique
+    in both.
+    """
+    rows = {name: row for row, name in enumerate(names)}
+    matched = np.array([rows.get(name, -1) for name in reference_names], dtype=np.int64)
+    taken = set(matched.tolist())
+    by_base: dict[str, list[int]] = {}
+    for row, name in enumerate(names):
+        by_base.setdefault(PurePosixPath(name).name, []).append(row)
+    reference_bases = [PurePosixPath(name).name for name in reference_names]
+    base_counts = Counter(reference_bases)
+    for row in np.flatnonzero(matched < 0).tolist():
+        base = reference_bases[row]
+        candidates = by_base.get(base, [])
+        if len(candidates) == 1 and base_counts[base] == 1 and candidates[0] not in taken:
+            matched[row] = candidates[0]
+    return matched
+
+
+def evaluate_poses(
+    model: Poses,
+    reference: Poses,
+    relative_thresholds_deg: Sequence[float] = RELATIVE_THRESHOLDS_DEG,
+    global_thresholds_deg: Sequence[float] = GLOBAL_THRESHOLDS_DEG,
+    min_baseline_ratio: float = MIN_BASELINE_RATIO,
+) -> PoseEvaluation:
+    """Compare a model's poses to reference poses.
+
+    Images are matched by name; those that the reference lacks (or has without a pose) are not scored, and
+    scored images that the model lacks count as errors of 180 degrees.
+
+    Parameters
+    ----------
+    model, reference : named cam_from_world poses.
+    relative_thresholds_deg : AUC of max(rotation, translation direction) over all ordered pairs (GLOMAP).
+    global_thresholds_deg : AUC of max(rotation, angle between the position vectors from the origin) over
+        all images after Sim(3) alignment (the Pose AUC of GTSfM; it depends on the reference's origin).
+    min_baseline_ratio : pairs closer than this share of the reference's extent have no direction.
+    """
+    known = reference.registered
+    names = [name for name, is_known in zip(reference.names, known, strict=True) if is_known]
+    reference_rotations, reference_translations = reference.rotations[known], reference.translations[known]
+    rows = match_names(model.names, names)
+    present = rows >= 0
+    rotations = np.full((len(names), 3, 3), np.nan)
+    translations = np.full((len(names), 3), np.nan)
+    rotations[present], translations[present] = (
+        model.rotations[rows[present]],
+        model.translations[rows[present]],
+    )
+    scored = Poses(names, rotations, translations).registered
+    reference_centers = center_of(reference_rotations, reference_translations)
+    extent = float(np.linalg.norm(np.ptp(reference_centers, axis=0))) if len(names) else 0.0
+
+    metrics: Metrics = {
+        "reference_images": len(names),
+        "reference_images_present": int(present.sum()),
+        "reference_images_registered": int(scored.sum()),
+    }
+    relative_rotation, relative_direction = relative_pose_errors(
+        rotations, translations, reference_rotations, reference_translations, min_baseline_ratio * extent
+    )
+    relative = np.maximum(relative_rotation, relative_direction)
+    metrics |= _auc_columns("relative_pose_auc", relative, relative_thresholds_deg)
+    valid = np.repeat(scored, max(len(names) - 1, 0)) & _others(scored)
+    metrics |= _distribution("relative_rotation_error_deg", relative_rotation[valid])
+    metrics |= _distribution("relative_translation_angle_deg", relative_direction[valid])
+
+    rotation_deg = np.full(len(names), np.nan)
+    direction_deg, position = rotation_deg.copy(), rotation_deg.copy()
+    similarity = None
+    if scored.any():
+        similarity = align_poses(
+            rotations[scored],
+            center_of(rotations[scored], translations[scored]),
+            reference_rotations[scored],
+            reference_centers[scored],
+        )
+        centers = similarity.transform_points(center_of(rotations[scored], translations[scored]))
+        rotation_deg[scored] = chordal_angle_deg(
+            similarity.transform_rotations(rotations[scored]), reference_rotations[scored]
+        )
+        position[scored] = np.linalg.norm(centers - reference_centers[scored], axis=1)
+        direction_deg[scored] = _origin_angles(
+            centers, reference_centers[scored], min_baseline_ratio * extent
+        )
+    pose_errors = np.where(scored, np.maximum(rotation_deg, direction_deg), FAILED_DEG)
+    metrics |= _auc_columns("pose_auc", pose_errors, global_thresholds_deg)
+    metrics |= _distribution("rotation_error_deg", rotation_deg[scored])
+    metrics |= _distribution("translation_angle_deg", direction_deg[scored])
+    metrics |= _distribution("position_error", position[scored])
+    relative_position = 100.0 * position[scored] / extent if extent > 0 else np.zeros(0)
+    metrics |= _distribution("position_error_percent", relative_position)
+    metrics["reference_extent"] = extent
+    metrics["alignment_scale"] = None if similarity is None else similarity.scale
+    return PoseEvaluation(metrics, names, rotation_deg, position, direction_deg, similarity)
+
+
+def model_metrics(registered: Array, offsets: Array, errors_px: Array) -> Metrics:
+    """The columns that need no truth.
+
+    Parameters
+    ----------
+    registered : (N,) bool, which images have a pose.
+    offsets : (T+1,) int64, rows of the observations of each point.
+    errors_px : (T,) float64, mean reprojection error of each point in pixels.
+    """
+    lengths = np.diff(offsets)
+    observations = int(lengths.sum())
+    images = int(registered.sum())
+    some = observations > 0
+    return {
+        "images": len(registered),
+        "registered_images": images,
+        "points": len(lengths),
+        "observations": observations,
+        "track_length_mean": float(lengths.mean()) if some else None,
+        "track_length_median": float(np.median(lengths)) if some else None,
+        "observations_per_image": observations / images if images else None,
+        "reprojection_error_px_mean": float(lengths @ errors_px / observations) if some else None,
+        "reprojection_error_px_median": float(np.median(errors_px)) if some else None,
+    }
+
+
+def _origin_angles(centers: Array, reference_centers: Array, min_length: float) -> Array:
+    angles = np.degrees(angle_between(centers, reference_centers))
+    angles[np.linalg.norm(reference_centers, axis=1) <= min_length] = 0.0
+    return angles
+
+
+def _others(flags: Array) -> Array:
+    """For all ordered pairs (j, i), i != j, the flag of i."""
+    return np.concatenate([np.delete(flags, j) for j in range(len(flags))]) if len(flags) else flags
+
+
+def _auc_columns(name: str, errors_deg: Array, thresholds_deg: Sequence[float]) -> Metrics:
+    areas = pose_auc(errors_deg, thresholds_deg)
+    return {f"{name}_{threshold:g}deg": area for threshold, area in zip(thresholds_deg, areas, strict=True)}
+
+
+def _distribution(name: str, values: Array) -> Metrics:
+    if len(values) == 0:
+        return {f"{name}_{part}": None for part in ("median", "mean", "p90", "max")}
+    return {
+        f"{name}_median": float(np.median(values)),
+        f"{name}_mean": float(np.mean(values)),
+        f"{name}_p90": float(np.percentile(values, 90)),
+        f"{name}_max": float(np.max(values)),
+    }

@@ -1,0 +1,104 @@
+"""A model as COLMAP's reconstruction object, which writes binary, text and PLY."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from snakesfm.geometry.camera import Camera
+from snakesfm.geometry.poses import to_rigid3d
+
+Array = NDArray[Any]
+
+
+def registered_images(rotations: Array, translations: Array) -> Array:
+    """Rows (n,) of the images that have a pose."""
+    finite = np.isfinite(rotations).all(axis=(1, 2)) & np.isfinite(translations).all(axis=1)
+    return np.flatnonzero(finite)
+
+
+def build_reconstruction(
+    names: Sequence[str],
+    camera_ids: Array,
+    cameras: Sequence[Camera],
+    rotations: Array,
+    translations: Array,
+    points: Array,
+    colors: Array,
+    errors_px: Array,
+    offsets: Array,
+    image_ids: Array,
+    keypoints: Array,
+) -> pycolmap.Reconstruction:
+    """A pycolmap reconstruction of the registered images.
+
+    Ids are rows plus one: image k of the index is COLMAP image k + 1, so too for cameras and points.
+    Cameras without a registered image are left out. The points2D of an image are its observations that
+    belong to a point, in the order of the points.
+
+    Parameters
+    ----------
+    names : N image names, relative POSIX paths.
+    camera_ids : (N,) int, row of each image's camera in ``cameras``.
+    rotations, translations : (N,3,3), (N,3) cam_from_world; NaN where not registered.
+    points, colors, errors_px : (T,3) float64, (T,3) uint8 RGB, (T,) mean reprojection error in pixels.
+    offsets, image_ids, keypoints : (T+1,), (L,), (L,2): observations of the points, in original pixels.
+    """
+    registered = registered_images(rotations, translations)
+    model = pycolmap.Reconstruction()
+    for row in sorted({int(camera_ids[image]) for image in registered}):
+        model.add_camera_with_trivial_rig(cameras[row].to_pycolmap(row + 1))
+    order = np.argsort(image_ids, kind="stable")
+    counts = np.bincount(image_ids, minlength=len(names))
+    starts = np.concatenate([[0], np.cumsum(counts)])
+    point2d_ids = np.empty(len(image_ids), dtype=np.int64)
+    point2d_ids[order] = np.arange(len(image_ids)) - np.repeat(starts[:-1], counts)
+    pixels = np.asarray(keypoints, dtype=np.float64)
+    for row in registered.tolist():
+        image = pycolmap.Image(
+            name=names[row],
+            keypoints=pixels[order[starts[row] : starts[row + 1]]].reshape(-1, 2),
+            camera_id=int(camera_ids[row]) + 1,
+            image_id=row + 1,
+        )
+        model.add_image_with_trivial_frame(image, to_rigid3d(rotations[row], translations[row]))
+    colmap_ids = (image_ids + 1).tolist()
+    elements = list(map(pycolmap.TrackElement, colmap_ids, point2d_ids.tolist()))
+    for row in range(len(points)):
+        track = pycolmap.Track(elements=elements[offsets[row] : offsets[row + 1]])
+        point = pycolmap.Point3D(xyz=points[row], color=colors[row], error=errors_px[row], track=track)
+        model.add_point3D_with_id(row + 1, point)
+    return model
+
+
+def summarize(
+    scene: str,
+    names: Sequence[str],
+    registered: Array,
+    offsets: Array,
+    errors_px: Array,
+    warnings: Sequence[str],
+) -> Mapping[str, Any]:
+    """What summary.json says of the model.
+
+    Parameters
+    ----------
+    registered : rows (n,) of the registered images.
+    offsets, errors_px : (T+1,) and (T,): observations and mean reprojection error of the points.
+    """
+    lengths = np.diff(offsets)
+    observations = int(lengths.sum())
+    missing = sorted(set(range(len(names))) - set(registered.tolist()))
+    return {
+        "scene": scene,
+        "images": len(names),
+        "registered_images": len(registered),
+        "not_registered": [names[row] for row in missing],
+        "points": len(lengths),
+        "observations": observations,
+        "mean_track_length": observations / len(lengths) if len(lengths) else 0.0,
+        "mean_reprojection_error_px": float(lengths @ errors_px) / observations if observations else 0.0,
+        "warnings": list(warnings),
+    }

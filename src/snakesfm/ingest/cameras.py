@@ -1,0 +1,191 @@
+"""Which images were taken by one camera, and what its intrinsics are before anything is measured."""
+
+from collections import defaultdict
+from collections.abc import Hashable, Sequence
+from dataclasses import dataclass
+from pathlib import PurePosixPath
+from typing import Any, Literal
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from snakesfm.geometry.camera import Camera
+from snakesfm.ingest.exif import Exif, focal_from_exif, is_cropped
+
+Array = NDArray[Any]
+Sharing = Literal["auto", "exif", "single", "per_folder", "per_image"]
+
+# so many camera models never agree on one image size by themselves: someone cropped to it
+MODELS_OF_ONE_SIZE = 5
+# images without EXIF are of one camera where at most one size comes with so many images
+IMAGES_PER_SIZE = 20
+
+
+@dataclass(frozen=True)
+class Photograph:
+    """An image's relative name, its size in pixels as stored, and its EXIF."""
+
+    name: str
+    width: int
+    height: int
+    exif: Exif
+
+    @property
+    def folder(self) -> str:
+        """The folder of the relative name."""
+        return str(PurePosixPath(self.name).parent)
+
+    @property
+    def body(self) -> tuple[str, str] | None:
+        """Make and model of the camera, or None where EXIF names no model."""
+        return (self.exif.make, self.exif.model) if self.exif.model else None
+
+
+@dataclass(frozen=True)
+class ImageCameras:
+    """Cameras in the order of their first image, the row of each image's camera, and EXIF focal lengths.
+
+    ``camera_ids`` is (N,) int32; ``focal_exif_px`` is (N,) float64 in pixels, NaN where EXIF gives none
+    or the image was cropped afterwards.
+    """
+
+    cameras: list[Camera]
+    camera_ids: Array
+    focal_exif_px: Array
+
+
+def assign_cameras(
+    photographs: Sequence[Photograph],
+    known: Sequence[Camera | None],
+    *,
+    sharing: Sharing,
+    model: str,
+    default_focal_ratio: float,
+    use_exif: bool,
+) -> ImageCameras:
+    """Give every image a camera.
+
+    Parameters
+    ----------
+    photographs : the images.
+    known : the image's known intrinsics, or None; equal ones are one camera.
+    sharing : which of the other images share a camera; see :func:`group_images`.
+    model : COLMAP camera model of the cameras that are not known.
+    default_focal_ratio : focal length as a multiple of the longer side where nothing is known.
+    use_exif : whether EXIF focal lengths are used.
+    """
+    cropped = np.array(find_cropped(photographs), dtype=bool)
+    stated = np.array(
+        [focal_from_exif(p.exif, p.width, p.height) if use_exif else np.nan for p in photographs],
+        dtype=np.float64,
+    )
+    unknown = [row for row, camera in enumerate(known) if camera is None]
+    groups: dict[int, Hashable] = dict(
+        zip(unknown, group_images([photographs[row] for row in unknown], sharing), strict=True)
+    )
+    rows_of: dict[Hashable, list[int]] = defaultdict(list)
+    for row, camera in enumerate(known):
+        rows_of[groups[row] if camera is None else camera].append(row)
+    cameras: list[Camera] = []
+    camera_ids = np.zeros(len(photographs), np.int32)
+    for rows in rows_of.values():
+        camera_ids[rows] = len(cameras)
+        first = photographs[rows[0]]
+        given = known[rows[0]]
+        focal, source = _initial_focal(
+            stated[rows], cropped[rows], default_focal_ratio * max(first.width, first.height)
+        )
+        cameras.append(given or _create_camera(model, first.width, first.height, focal, source))
+    return ImageCameras(cameras, camera_ids, np.where(cropped, np.nan, stated))
+
+
+def find_cropped(photographs: Sequence[Photograph]) -> list[bool]:
+    """Whether each image is not the whole picture that its camera took, so its EXIF focal length misleads.
+
+    That is seen in the image's shape (:func:`snakesfm.ingest.exif.is_cropped`), or in a folder whose images
+    have all one size though many camera models took them.
+    """
+    sizes = defaultdict(set)
+    bodies = defaultdict(set)
+    for photograph in photographs:
+        sizes[photograph.folder].add((photograph.width, photograph.height))
+        if photograph.body:
+            bodies[photograph.folder].add(photograph.body)
+    return [
+        (len(sizes[p.folder]) == 1 and len(bodies[p.folder]) >= MODELS_OF_ONE_SIZE)
+        or (p.body is not None and is_cropped(p.exif, p.width, p.height))
+        for p in photographs
+    ]
+
+
+def group_images(photographs: Sequence[Photograph], sharing: Sharing) -> list[Hashable]:
+    """A key per image; images with equal keys share a camera. Images of different size never do.
+
+    Parameters
+    ----------
+    photographs : the images.
+    sharing : ``single``, ``per_folder`` and ``per_image`` as they say. ``exif``: by camera, lens and focal
+        length; images without EXIF each have their own. ``auto``: as ``exif``, but cropped images have
+        their own, and images without EXIF share per folder where their sizes agree as one camera's do.
+    """
+    if sharing == "single":
+        return [(p.width, p.height) for p in photographs]
+    if sharing == "per_folder":
+        return [(p.folder, p.width, p.height) for p in photographs]
+    if sharing == "per_image":
+        return [p.name for p in photographs]
+    if sharing == "exif":
+        return [_exif_key(p) if p.body else p.name for p in photographs]
+    uniform = _uniform_folders(photographs)
+    keys: list[Hashable] = []
+    for photograph, cropped in zip(photographs, find_cropped(photographs), strict=True):
+        if photograph.body:
+            keys.append(photograph.name if cropped else _exif_key(photograph))
+        elif photograph.folder in uniform:
+            keys.append((photograph.folder, photograph.width, photograph.height))
+        else:
+            keys.append(photograph.name)
+    return keys
+
+
+def _exif_key(photograph: Photograph) -> Hashable:
+    exif = photograph.exif
+    # NaN is not equal to itself
+    focal = [round(value, 3) if value > 0 else 0.0 for value in (exif.focal_mm, exif.focal_35mm)]
+    return ("exif", exif.make, exif.model, exif.lens, photograph.width, photograph.height, *focal)
+
+
+def _uniform_folders(photographs: Sequence[Photograph]) -> set[str]:
+    """Folders whose images without EXIF look like those of one camera.
+
+    Portrait and landscape count as one size. Crowd photographs differ in size, or stand beside photographs
+    that name several cameras.
+    """
+    bodies = defaultdict(set)
+    sizes = defaultdict(list)
+    for photograph in photographs:
+        if photograph.body:
+            bodies[photograph.folder].add(photograph.body)
+        else:
+            sizes[photograph.folder].append(tuple(sorted((photograph.width, photograph.height))))
+    return {
+        folder
+        for folder, all_sizes in sizes.items()
+        if len(bodies[folder]) <= 1 and len(set(all_sizes)) <= max(1, len(all_sizes) // IMAGES_PER_SIZE)
+    }
+
+
+def _initial_focal(stated: Array, cropped: Array, default: float) -> tuple[float, str]:
+    """Focal length in pixels of one camera's images, and where it is from."""
+    trusted = stated[~cropped & (stated > 0)]
+    if len(trusted):
+        return float(np.median(trusted)), "exif"
+    # cropping never widens the view, so what EXIF states is a lower bound
+    bounds = stated[cropped & (stated > 0)]
+    return max(default, float(np.median(bounds)) if len(bounds) else 0.0), "default"
+
+
+def _create_camera(model: str, width: int, height: int, focal: float, source: str) -> Camera:
+    camera = pycolmap.Camera.create_from_model_name(1, model, focal, width, height)
+    return Camera(model, width, height, tuple(camera.params.tolist()), source)

@@ -1,0 +1,255 @@
+"""Known intrinsics: COLMAP's cameras files and 3x3 matrices, and which image they belong to."""
+
+import struct
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+
+from snakesfm.errors import ConfigError
+from snakesfm.geometry.camera import Camera
+
+FILE_NAMES = ("cameras.bin", "cameras.txt", "K.txt")
+# images.bin: quaternion and translation between image id and camera id
+POSE_BYTES = 56
+POINT_BYTES = 24
+
+
+@dataclass(frozen=True)
+class KnownCameras:
+    """Intrinsics that the user gave.
+
+    Parameters
+    ----------
+    path : the file, for messages.
+    cameras : by COLMAP camera id; the one of a 3x3 matrix has width and height 0.
+    camera_of : camera id by image name; empty where no list of images lies beside the file.
+    """
+
+    path: Path
+    cameras: dict[int, Camera]
+    camera_of: dict[str, int]
+
+
+def read_known_cameras(path: Path | str) -> KnownCameras:
+    """Read intrinsics from cameras.txt, cameras.bin, a folder that holds one of them, or a 3x3 K.txt.
+
+    Of images.txt or images.bin beside a COLMAP file only names and camera ids are used, never poses. A
+    matrix is taken to be in this project's pixels, where the image's first corner is (0, 0).
+
+    Raises
+    ------
+    ConfigError : the file is missing, or is not what its name says.
+    """
+    path = _find_file(Path(path))
+    try:
+        if path.suffix == ".bin":
+            cameras = dict(_binary_cameras(path.read_bytes()))
+        else:
+            lines = _content_lines(path)
+            rows = [line.split() for line in lines]
+            if len(rows) == 3 and all(len(row) == 3 for row in rows):
+                return KnownCameras(path, {1: _matrix_camera(path, rows)}, {})
+            cameras = dict(_text_cameras(lines))
+    except (ValueError, UnicodeDecodeError, struct.error, IndexError) as error:
+        raise ConfigError(
+            f"{path}, given as cameras=, is neither COLMAP cameras nor a 3x3 matrix ({error}): correct it."
+        ) from None
+    if not cameras:
+        raise ConfigError(f"{path}, given as cameras=, holds no camera: correct it or remove the key.")
+    for camera_id, camera in cameras.items():
+        _check(path, camera_id, camera)
+    camera_of = _image_cameras(path)
+    missing = sorted(set(camera_of.values()) - set(cameras))
+    if missing:
+        raise ConfigError(f"Images beside {path} name camera {missing[0]}, which it lacks: add it there.")
+    return KnownCameras(path, cameras, camera_of)
+
+
+def match_known_cameras(
+    known: KnownCameras, names: Sequence[str], sizes: Sequence[tuple[int, int]]
+) -> list[Camera | None]:
+    """The known camera of each image, scaled to the image's size; None where there is none.
+
+    An image that the list names has the camera named there. Without a list, one camera is that of all
+    images, and of several the one of the image's size. An image that a list lacks has the one camera of its
+    size, if any.
+
+    Raises
+    ------
+    ConfigError : an image's camera is of another shape than the image, or cannot be told.
+    """
+    if any(camera.width == 0 for camera in known.cameras.values()):
+        return list(_match_matrix(known, names, sizes))
+    listed = [known.camera_of.get(name) for name in names]
+    if known.camera_of and any(camera_id is not None for camera_id in listed):
+        fallback: Camera | None = None
+        strict = False
+    else:
+        fallback = next(iter(known.cameras.values())) if len(known.cameras) == 1 else None
+        strict = True
+    found: list[Camera | None] = []
+    for name, (width, height), camera_id in zip(names, sizes, listed, strict=True):
+        if camera_id is not None:
+            found.append(_fit(known.path, known.cameras[camera_id], name, width, height))
+            continue
+        same = [c for c in known.cameras.values() if (c.width, c.height) == (width, height)]
+        if fallback is not None:
+            found.append(_fit(known.path, fallback, name, width, height))
+        elif len(same) == 1:
+            found.append(same[0])
+        elif strict:
+            raise ConfigError(
+                f"{known.path} holds {len(known.cameras)} cameras, of which {len(same)} have the size "
+                f"{width} x {height} of {name}: put the images.txt beside it that says whose is which."
+            )
+        else:
+            found.append(None)
+    return found
+
+
+def _find_file(path: Path) -> Path:
+    path = path.expanduser()
+    if path.is_dir():
+        for name in FILE_NAMES:
+            if (path / name).is_file():
+                return path / name
+        raise ConfigError(f"{path}, given as cameras=, holds none of {', '.join(FILE_NAMES)}: name one.")
+    if not path.is_file():
+        raise ConfigError(f"{path}, given as cameras=, does not exist: correct the path or remove the key.")
+    return path
+
+
+def _content_lines(path: Path) -> list[str]:
+    lines = path.read_text("utf-8-sig").splitlines()
+    return [line.strip() for line in lines if line.strip() and not line.lstrip().startswith("#")]
+
+
+def _matrix_camera(path: Path, rows: list[list[str]]) -> Camera:
+    K = np.array(rows, dtype=np.float64)
+    fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
+    plain = K[2].tolist() == [0, 0, 1] and K[1, 0] == 0 and abs(K[0, 1]) < 1e-3 * abs(fx)
+    if not (plain and np.isfinite(K).all() and min(fx, fy, cx, cy) > 0):
+        raise ConfigError(
+            f"{path}, given as cameras=, is no matrix [fx 0 cx; 0 fy cy; 0 0 1] in pixels: correct it."
+        )
+    return Camera("PINHOLE", 0, 0, (float(fx), float(fy), float(cx), float(cy)))
+
+
+def _text_cameras(lines: list[str]) -> Iterator[tuple[int, Camera]]:
+    for line in lines:
+        words = line.split()
+        if len(words) < 5:
+            raise ValueError(f"'{line[:60]}' has fewer than 5 words")
+        params = tuple(float(word) for word in words[4:])
+        yield int(words[0]), Camera(words[1], int(words[2]), int(words[3]), params)
+
+
+def _binary_cameras(data: bytes) -> Iterator[tuple[int, Camera]]:
+    (count,) = struct.unpack_from("<Q", data)
+    place = 8
+    for _ in range(count):
+        camera_id, model_id, width, height = struct.unpack_from("<IiQQ", data, place)
+        place += 24
+        # the constructor, unlike create_from_model_id, raises ValueError on a number that is no model
+        model = pycolmap.CameraModelId(model_id)
+        slots = len(pycolmap.Camera.create_from_model_id(1, model, 1.0, 1, 1).params)
+        params = struct.unpack_from(f"<{slots}d", data, place)
+        place += 8 * slots
+        yield camera_id, Camera(model.name, width, height, params)
+
+
+def _check(path: Path, camera_id: int, camera: Camera) -> None:
+    where = f"Camera {camera_id} of {path}, given as cameras=,"
+    if camera.model not in pycolmap.CameraModelId.__members__ or camera.model == "INVALID":
+        raise ConfigError(
+            f"{where} has the model '{camera.model}', which COLMAP does not know: correct it."
+        )
+    try:
+        parsed = camera.to_pycolmap()
+        focal = parsed.mean_focal_length()
+        valid = parsed.verify_params() and np.isfinite(parsed.params).all() and focal > 0
+    except (ValueError, RuntimeError):
+        valid = False
+    if not (valid and camera.width > 0 and camera.height > 0):
+        raise ConfigError(f"{where} does not have the parameters of a {camera.model}: correct it.")
+
+
+def _image_cameras(path: Path) -> dict[str, int]:
+    """Camera id by image name from the list of images beside a COLMAP cameras file."""
+    listing = path.with_name("images" + path.suffix)
+    if not listing.is_file():
+        return {}
+    try:
+        if listing.suffix == ".bin":
+            return dict(_binary_image_cameras(listing.read_bytes()))
+        return dict(_text_image_cameras(listing.read_text("utf-8-sig")))
+    except (ValueError, UnicodeDecodeError, struct.error, IndexError) as error:
+        raise ConfigError(
+            f"{listing}, beside the file given as cameras=, is no COLMAP list of images ({error}): "
+            "correct it or move it away."
+        ) from None
+
+
+def _text_image_cameras(text: str) -> Iterator[tuple[str, int]]:
+    # every image has two lines, and the second, its points, may be empty
+    lines = [line.strip() for line in text.splitlines() if not line.startswith("#")]
+    for line in lines[::2]:
+        if not line:
+            continue
+        words = line.split(maxsplit=9)
+        if len(words) < 10:
+            raise ValueError(f"'{line[:60]}' has fewer than 10 words")
+        yield words[9], int(words[8])
+
+
+def _binary_image_cameras(data: bytes) -> Iterator[tuple[str, int]]:
+    (count,) = struct.unpack_from("<Q", data)
+    place = 8
+    for _ in range(count):
+        place += 4 + POSE_BYTES
+        (camera_id,) = struct.unpack_from("<I", data, place)
+        end = data.index(b"\0", place + 4)
+        name = data[place + 4 : end].decode()
+        (points,) = struct.unpack_from("<Q", data, end + 1)
+        place = end + 9 + points * POINT_BYTES
+        yield name, camera_id
+
+
+def _match_matrix(
+    known: KnownCameras, names: Sequence[str], sizes: Sequence[tuple[int, int]]
+) -> Iterator[Camera]:
+    if not names:
+        return
+    (camera,) = known.cameras.values()
+    _, _, cx, cy = camera.params
+    # the matrix belongs to the size whose centre is nearest to its principal point
+    width, height = min(sorted(set(sizes)), key=lambda size: abs(2 * cx - size[0]) + abs(2 * cy - size[1]))
+    if not (0 < cx < width and 0 < cy < height):
+        raise ConfigError(
+            f"The principal point ({cx:g}, {cy:g}) of {known.path} lies outside the images of "
+            f"{width} x {height} pixels: give the matrix for the size of the images."
+        )
+    sized = replace(camera, width=width, height=height)
+    for name, size in zip(names, sizes, strict=True):
+        yield _fit(known.path, sized, name, *size)
+
+
+def _fit(path: Path, camera: Camera, name: str, width: int, height: int) -> Camera:
+    """The camera for an image of the same shape."""
+    if (camera.width, camera.height) == (width, height):
+        return camera
+    across, down = width / camera.width, height / camera.height
+    # a scaled image's sides are rounded to pixels
+    if abs(across * camera.height - height) > 1 and abs(down * camera.width - width) > 1:
+        turned = (camera.height, camera.width) == (width, height)
+        hint = "; images are used as stored, without their EXIF rotation" if turned else ""
+        raise ConfigError(
+            f"{name} has {width} x {height} pixels, which is no scaling of the {camera.width} x "
+            f"{camera.height} of its camera in {path}: correct that file or the image{hint}."
+        )
+    scaled = camera.to_pycolmap()
+    scaled.rescale(width, height)
+    return replace(camera, width=width, height=height, params=tuple(scaled.params.tolist()))

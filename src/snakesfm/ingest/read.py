@@ -1,0 +1,255 @@
+"""Image files: a quick check of header and end, and the pixels.
+
+Pixels are those that the file stores: an EXIF orientation is read, but never applied. COLMAP, 3DGS and
+nerfstudio load the linked images in just this way (pycolmap.Bitmap and PIL ignore the tag), intrinsics
+belong to the sensor's own grid, and portrait and landscape photographs of one camera share them.
+"""
+
+import mmap
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from PIL import (
+    BmpImagePlugin,  # noqa: F401 - naming the plugins spares PIL the import of its fifty others
+    ExifTags,
+    Image,
+    JpegImagePlugin,  # noqa: F401
+    MpoImagePlugin,  # noqa: F401
+    PngImagePlugin,  # noqa: F401
+    TiffImagePlugin,  # noqa: F401
+    UnidentifiedImageError,
+    WebPImagePlugin,  # noqa: F401
+)
+
+from snakesfm.errors import ImageError
+from snakesfm.ingest.exif import Exif, read_exif
+
+Array = NDArray[Any]
+
+# a JPEG that holds several pictures is opened as JPEG and then calls itself MPO
+FORMATS = ("JPEG", "PNG", "TIFF", "WEBP", "BMP")
+MINIMUM_SIDE_PX = 32
+# far beyond any camera, and still read in a few GB
+MAXIMUM_PIXELS = 1 << 30
+# PIL applies the orientation of TIFF files, and only of these
+UNDO_TURN = {
+    2: Image.Transpose.FLIP_LEFT_RIGHT,
+    3: Image.Transpose.ROTATE_180,
+    4: Image.Transpose.FLIP_TOP_BOTTOM,
+    5: Image.Transpose.TRANSPOSE,
+    6: Image.Transpose.ROTATE_90,
+    7: Image.Transpose.TRANSVERSE,
+    8: Image.Transpose.ROTATE_270,
+}
+# the bound above takes the place of PIL's, which refuses aerial photographs
+Image.MAX_IMAGE_PIXELS = None
+
+
+@dataclass(frozen=True)
+class ImageHeader:
+    """What a file says of its image: size as stored, in pixels, and EXIF."""
+
+    width: int
+    height: int
+    exif: Exif
+
+
+@dataclass(frozen=True)
+class ImagePixels:
+    """An image as stored, or reduced: ``gray`` (H,W) uint8 and ``rgb`` (H,W,3) uint8.
+
+    Pixel x, y of the file is x / ``reduction``, y / ``reduction`` here, exactly: whole blocks of pixels
+    were reduced to one, and the last column and row may stand for blocks that end outside the file's image.
+    """
+
+    gray: Array
+    rgb: Array
+    reduction: int = 1
+
+
+def read_header(path: Path | str) -> ImageHeader:
+    """Read size and EXIF, and check that the file goes on to its end, without decoding it.
+
+    Raises
+    ------
+    ImageError : the file is missing, empty, no image, cut off, or its image is too small or too large.
+    """
+    with _open(path) as image:
+        _check_end(Path(path), image)
+        width, height = _stored_size(image)
+        return ImageHeader(width, height, read_exif(image))
+
+
+def read_image(path: Path | str, shorter_side_px: int | None = None) -> ImagePixels:
+    """Read the pixels as stored, whatever the file's colour space and depth.
+
+    Deeper than 8 bit: the brightest value decides which bits are kept, so 12-bit data in a 16-bit file is
+    not dark. Alpha: composed over black. Several pages or frames: the first.
+
+    Parameters
+    ----------
+    path : the file.
+    shorter_side_px : a large JPEG may be decoded at 1/2, 1/4 or 1/8, as long as its shorter side stays at
+        least this; that takes a fraction of the time. None for full size.
+
+    Raises
+    ------
+    ImageError : as :func:`read_header`, or the pixels cannot be decoded to the last.
+    """
+    with _open(path) as image:
+        _check_end(Path(path), image)
+        try:
+            if image.format in ("JPEG", "MPO") and image.mode in ("RGB", "L"):
+                return _decode_jpeg(Path(path), min(image.size), shorter_side_px)
+            turn_back = UNDO_TURN.get(_tiff_orientation(image))
+            image.load()
+            return _to_pixels(image if turn_back is None else image.transpose(turn_back))
+        # PIL raises errors of every type on damaged files, and one bad image must not stop the others
+        except Exception as error:
+            raise ImageError(
+                f"{path} is damaged ({error}): replace it by an intact copy or remove it."
+            ) from error
+
+
+def _open(path: Path | str) -> Image.Image:
+    path = Path(path)
+    # as in read_image, the last except takes whatever PIL raises
+    try:
+        if path.is_dir():
+            raise ImageError(f"{path} is a folder, not an image: rename or remove it.")
+        if path.stat().st_size == 0:
+            raise ImageError(f"{path} is empty: replace it by an intact copy or remove it.")
+        image = Image.open(path, formats=FORMATS)
+    except FileNotFoundError:
+        raise ImageError(f"{path} does not exist or is a broken link: restore or remove it.") from None
+    except UnidentifiedImageError:
+        raise ImageError(
+            f"{path} is no JPEG, PNG, TIFF, WebP or BMP image: convert it to one of these or remove it."
+        ) from None
+    except ImageError:
+        raise
+    except PermissionError:
+        raise ImageError(f"{path} may not be read: correct its permissions or remove it.") from None
+    except Exception as error:
+        raise ImageError(
+            f"{path} is damaged ({error}): replace it by an intact copy or remove it."
+        ) from error
+    width, height = image.size
+    if min(width, height) < MINIMUM_SIDE_PX:
+        image.close()
+        raise ImageError(
+            f"{path} has only {width} x {height} pixels, but each side needs {MINIMUM_SIDE_PX}: remove it."
+        )
+    if width * height > MAXIMUM_PIXELS:
+        image.close()
+        raise ImageError(f"{path} has {width} x {height} pixels, which is too large: scale it down.")
+    return image
+
+
+def _check_end(path: Path, image: Image.Image) -> None:
+    complete = True
+    with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+        if image.format in ("JPEG", "MPO"):
+            complete = _jpeg_is_complete(data)
+        elif image.format == "PNG":
+            complete = data.rfind(b"IEND") >= 0
+        elif image.format == "WEBP":
+            complete = len(data) >= 8 + int.from_bytes(data[4:8], "little")
+        elif image.format == "TIFF":
+            complete = _tiff_is_complete(image, len(data))
+    if not complete:
+        raise ImageError(f"{path} is cut off before its end: replace it by an intact copy or remove it.")
+
+
+def _jpeg_is_complete(data: mmap.mmap) -> bool:
+    """Whether an end marker follows the start of the scan; a thumbnail in the header has its own."""
+    if data[-2:] == b"\xff\xd9":
+        return True
+    place = 2
+    while place + 4 <= len(data) and data[place] == 0xFF:
+        marker = data[place + 1]
+        if marker == 0xFF:
+            place += 1
+        elif marker == 0xDA:
+            return data.find(b"\xff\xd9", place) >= 0
+        else:
+            place += 2 + int.from_bytes(data[place + 2 : place + 4], "big")
+    return False
+
+
+def _tiff_is_complete(image: Image.Image, size: int) -> bool:
+    tags = _tiff_tags(image)
+    for offsets, counts in ((273, 279), (324, 325)):
+        starts, lengths = (np.atleast_1d(tags.get(tag, ())) for tag in (offsets, counts))
+        if len(starts) == len(lengths) and np.any(starts + lengths > size):
+            return False
+    return True
+
+
+def _tiff_tags(image: Image.Image) -> Any:
+    return getattr(image, "tag_v2", {}) if image.format == "TIFF" else {}
+
+
+def _tiff_orientation(image: Image.Image) -> int:
+    return int(_tiff_tags(image).get(ExifTags.Base.Orientation, 1))
+
+
+def _stored_size(image: Image.Image) -> tuple[int, int]:
+    tags = _tiff_tags(image)
+    width = tags.get(ExifTags.Base.ImageWidth, image.width)
+    return int(width), int(tags.get(ExifTags.Base.ImageLength, image.height))
+
+
+def _decode_jpeg(path: Path, side: int, shorter_side_px: int | None) -> ImagePixels:
+    """Decode an 8-bit gray or colour JPEG with OpenCV: PIL's very pixels, with a copy less."""
+    reduction = 1
+    while shorter_side_px and reduction < 8 and side // (2 * reduction) >= shorter_side_px:
+        reduction *= 2
+    flags = {
+        1: cv2.IMREAD_COLOR_BGR,
+        2: cv2.IMREAD_REDUCED_COLOR_2,
+        4: cv2.IMREAD_REDUCED_COLOR_4,
+        8: cv2.IMREAD_REDUCED_COLOR_8,
+    }[reduction]
+    data = np.frombuffer(path.read_bytes(), np.uint8)
+    bgr = cv2.imdecode(data, flags | cv2.IMREAD_IGNORE_ORIENTATION)
+    if bgr is None:
+        raise ValueError("it cannot be decoded")
+    rgb = cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB)
+    return ImagePixels(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), rgb, reduction)
+
+
+def _to_pixels(image: Image.Image) -> ImagePixels:
+    if image.mode.startswith(("I", "F")):
+        return _from_gray(_to_8_bit(np.asarray(image)))
+    if image.has_transparency_data:
+        rgba = image if image.mode == "RGBA" else image.convert("RGBA")
+        black = Image.new("RGBA", rgba.size, (0, 0, 0, 255))
+        return _from_rgb(np.asarray(Image.alpha_composite(black, rgba).convert("RGB")))
+    if image.mode in ("1", "L"):
+        return _from_gray(np.asarray(image.convert("L")))
+    return _from_rgb(np.asarray(image.convert("RGB")))
+
+
+def _from_gray(gray: Array) -> ImagePixels:
+    return ImagePixels(gray, cv2.cvtColor(gray, cv2.COLOR_GRAY2RGB))
+
+
+def _from_rgb(rgb: Array) -> ImagePixels:
+    return ImagePixels(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), rgb)
+
+
+def _to_8_bit(values: Array) -> Array:
+    """Gray values (H,W) of any type to uint8."""
+    if values.dtype.kind == "f":
+        values = np.nan_to_num(values, nan=0.0, posinf=0.0, neginf=0.0)
+        low, high = float(values.min()), float(values.max())
+        scale = 255.0 / (high - low) if high > low else 0.0
+        return np.round((values - low) * scale).astype(np.uint8)
+    values = np.maximum(values, 0)
+    shift = max(int(values.max()).bit_length() - 8, 0)
+    return (values >> shift).astype(np.uint8)

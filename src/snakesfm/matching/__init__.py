@@ -1,0 +1,1 @@
+"""Matching of local descriptors between two images."""

@@ -1,0 +1,114 @@
+"""Per image: what each step made of it, and why an image has no pose."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from snakesfm.geometry.camera import Camera
+
+Array = NDArray[Any]
+
+
+@dataclass(frozen=True)
+class ImageCounts:
+    """What each step left of every image, columns of length N."""
+
+    pairs: Array
+    accepted: Array
+    kept: Array
+    components: Array
+    rotated: Array
+    track_observations: Array
+    point_observations: Array
+    registered: Array
+    observations: Array
+    mean_error_px: Array
+
+
+def count_by_image(ids: Array, count: int) -> Array:
+    """How often each of ``count`` images occurs in ``ids``, (count,) int64."""
+    return np.bincount(np.asarray(ids, dtype=np.int64).ravel(), minlength=count)
+
+
+def observation_errors(
+    cameras: Sequence[Camera],
+    camera_ids: Array,
+    rotations: Array,
+    translations: Array,
+    points: Array,
+    image_ids: Array,
+    keypoints: Array,
+) -> Array:
+    """Reprojection errors (L,) in pixels of all observations; NaN behind the camera.
+
+    Parameters
+    ----------
+    points : (L,3) the observed point of each observation, in the world.
+    image_ids, keypoints : (L,), (L,2) observations.
+    """
+    errors = np.full(len(image_ids), np.nan)
+    order = np.argsort(image_ids, kind="stable")
+    bounds = np.searchsorted(image_ids[order], np.arange(len(camera_ids) + 1))
+    for image in range(len(camera_ids)):
+        rows = order[bounds[image] : bounds[image + 1]]
+        if len(rows) == 0:
+            continue
+        local = points[rows] @ rotations[image].T + translations[image]
+        camera = cameras[int(camera_ids[image])].to_pycolmap()
+        pixels = np.asarray(camera.img_from_cam(local), dtype=np.float64).reshape(-1, 2)
+        errors[rows] = np.linalg.norm(pixels - keypoints[rows], axis=1)
+    return errors
+
+
+def mean_by_image(values: Array, image_ids: Array, count: int) -> Array:
+    """Mean of the finite values of each image (count,), NaN where it has none."""
+    finite = np.isfinite(values)
+    totals = np.bincount(image_ids[finite], weights=values[finite], minlength=count)
+    numbers = np.bincount(image_ids[finite], minlength=count)
+    means: Array = np.divide(totals, numbers, out=np.full(count, np.nan), where=numbers > 0)
+    return means
+
+
+def reason_not_registered(
+    image: int,
+    counts: ImageCounts,
+    duplicate_of: str,
+    rejections: dict[str, int],
+    edge_labels: dict[str, int],
+) -> str:
+    """One sentence on where an image without a pose was lost.
+
+    Parameters
+    ----------
+    image : row of the index.
+    duplicate_of : name of the first image with the same bytes, or "".
+    rejections, edge_labels : how many of the image's pairs and edges were refused for which reason.
+    """
+    if counts.registered[image]:
+        return ""
+    if duplicate_of:
+        return f"It has the same bytes as {duplicate_of}, which stands for it."
+    if counts.pairs[image] == 0:
+        return "No pair with it was selected and matched."
+    if counts.accepted[image] == 0:
+        return f"None of its {counts.pairs[image]} pairs was accepted: {_listed(rejections)}."
+    if counts.kept[image] == 0:
+        return f"All its {counts.accepted[image]} view-graph edges were refused: {_listed(edge_labels)}."
+    if counts.components[image] != 0:
+        size = int(np.sum(counts.components == counts.components[image]))
+        return f"It is in a component of {size} images that is not connected to the largest one."
+    if not counts.rotated[image]:
+        return "Rotation averaging gave it no rotation."
+    if counts.track_observations[image] == 0:
+        return "No track passes through it."
+    if counts.point_observations[image] == 0:
+        return "None of its tracks could be triangulated."
+    return "Bundle adjustment dropped it: too few of its observations agreed with the model."
+
+
+def _listed(reasons: dict[str, int]) -> str:
+    parts = [f"{name.replace('_', ' ')} ({count})" for name, count in sorted(reasons.items()) if count]
+    return ", ".join(parts) or "no reason recorded"

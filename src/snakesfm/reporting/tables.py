@@ -1,0 +1,135 @@
+"""Rows of the report's tables, as text, numbers and None."""
+
+import csv
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from snakesfm.reporting.registration import ImageCounts
+
+Array = NDArray[Any]
+STATISTICS = ("median", "mean", "p90", "max")
+
+
+def label_counts(labels: Array, names: Sequence[str]) -> list[tuple[str, int]]:
+    """How many items have which label, as (name, count) in the order of the labels, without zeros."""
+    values, counts = np.unique(labels, return_counts=True)
+    return [
+        (names[value] if 0 <= value < len(names) else f"label {value}", count)
+        for value, count in zip(values.tolist(), counts.tolist(), strict=True)
+    ]
+
+
+def bundle_rows(names: Array, counts: Array, costs: Array, errors_px: Array) -> list[list[Any]]:
+    """One row per round of the adjustment: name, images, points, observations, costs, mean error."""
+    return [
+        [str(names[k]), *counts[k].tolist(), *costs[k].tolist(), float(errors_px[k])]
+        for k in range(len(names))
+    ]
+
+
+def metric_tables(metrics: Mapping[str, Any]) -> list[tuple[str, list[str], list[list[Any]]]]:
+    """Title, heads and rows of the metrics' tables: areas by threshold, errors by statistic, the rest."""
+    numbers = {
+        name: value
+        for name, value in metrics.items()
+        if isinstance(value, int | float) and not isinstance(value, bool)
+    }
+    areas = _grouped(numbers, re.compile(r"(?P<row>.*_auc)_(?P<column>[\d.]+)deg"))
+    errors = _grouped(numbers, re.compile(r"(?P<row>.*)_(?P<column>median|mean|p90|max)"))
+    thresholds = sorted({column for row in areas.values() for column in row}, key=float)
+    others = [[_words(name), value] for name, value in numbers.items() if not _is_grouped(name)]
+    return [
+        (
+            "Accuracy: area under the recall curve, percent",
+            ["poses", *(f"@{column} deg" for column in thresholds)],
+            [[_words(row), *(cells.get(column) for column in thresholds)] for row, cells in areas.items()],
+        ),
+        (
+            "Errors and sizes",
+            ["quantity", *STATISTICS],
+            [[_words(row), *(cells.get(column) for column in STATISTICS)] for row, cells in errors.items()],
+        ),
+        ("Counts", ["quantity", "value"], others),
+    ]
+
+
+def _grouped(numbers: Mapping[str, Any], pattern: re.Pattern[str]) -> dict[str, dict[str, Any]]:
+    groups: dict[str, dict[str, Any]] = {}
+    for name, value in numbers.items():
+        match = pattern.fullmatch(name)
+        if match:
+            groups.setdefault(match["row"], {})[match["column"]] = value
+    return groups
+
+
+def _is_grouped(name: str) -> bool:
+    return re.fullmatch(r".*_auc_[\d.]+deg|.*_(median|mean|p90|max)", name) is not None
+
+
+def _words(name: str) -> str:
+    return name.replace("_", " ").replace("auc", "AUC")
+
+
+def image_rows(
+    names: Sequence[str],
+    counts: ImageCounts,
+    per_image: Mapping[str, Mapping[str, float | None]],
+    most: int,
+) -> tuple[list[list[Any]], str]:
+    """Rows of the table of images, and a note where it does not show all.
+
+    Parameters
+    ----------
+    per_image : errors of the scored images against the reference, may be empty.
+    most : rows at most; those with the fewest observations are shown.
+    """
+    shown = np.arange(len(names))
+    note = ""
+    if len(names) > most:
+        shown = np.sort(np.argsort(counts.observations, kind="stable")[:most])
+        note = f"The {most:,} images with the fewest observations of {len(names):,}."
+    rows = []
+    for image in shown.tolist():
+        error = float(counts.mean_error_px[image])
+        row: list[Any] = [
+            names[image],
+            "yes" if counts.registered[image] else "no",
+            int(counts.pairs[image]),
+            int(counts.accepted[image]),
+            int(counts.kept[image]),
+            int(counts.observations[image]),
+            error if np.isfinite(error) else None,
+        ]
+        if per_image:
+            scores = per_image.get(names[image], {})
+            row += [scores.get("rotation_error_deg"), scores.get("position_error")]
+        rows.append(row)
+    return rows, note
+
+
+def stage_times(benchmarks: Mapping[Path, str]) -> dict[str, tuple[float, float]]:
+    """Seconds (sum over jobs) and peak memory in MB (largest job) of each stage.
+
+    Parameters
+    ----------
+    benchmarks : Snakemake's benchmark tables by path; the folder's name is the stage.
+    """
+    totals: dict[str, tuple[float, float]] = {}
+    for path, text in benchmarks.items():
+        for row in csv.DictReader(text.splitlines(), delimiter="\t"):
+            seconds, peak = totals.get(path.parent.name, (0.0, 0.0))
+            used = _number(row.get("max_rss"))
+            totals[path.parent.name] = seconds + _number(row.get("s")), max(peak, used)
+    return totals
+
+
+def _number(text: str | None) -> float:
+    try:
+        return float(text or "nan") if text not in (None, "-", "NA") else 0.0
+    except ValueError:
+        return 0.0

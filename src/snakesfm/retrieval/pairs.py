@@ -1,0 +1,120 @@
+"""The choice of image pairs: all, neighbours in order, similar ones, or listed by the user."""
+
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[Any]
+
+REASONS = ("exhaustive", "sequential", "retrieved", "listed")
+
+
+@dataclass(frozen=True)
+class PairTable:
+    """Pairs of images with the reasons why they were chosen.
+
+    Parameters
+    ----------
+    pairs : (P,2) int64 rows (i, j) with i < j, sorted and distinct.
+    reasons : (P,) uint8, bit k is set where ``REASONS[k]`` applies.
+    similarities : (P,) float32, NaN where not computed.
+    """
+
+    pairs: Array
+    reasons: Array
+    similarities: Array
+
+    @classmethod
+    def of(cls, pairs: Array, reason: str, similarities: Array | None = None) -> "PairTable":
+        """Pairs (P,2) in any order, even twice or as (j, i); pairs of an image with itself are left out."""
+        pairs = np.sort(np.asarray(pairs, dtype=np.int64).reshape(-1, 2), axis=1)
+        if similarities is None:
+            similarities = np.full(len(pairs), np.nan, np.float32)
+        proper = pairs[:, 0] < pairs[:, 1]
+        distinct, first = np.unique(pairs[proper], axis=0, return_index=True)
+        bit = np.uint8(1 << REASONS.index(reason))
+        return cls(distinct, np.full(len(distinct), bit), similarities[proper][first])
+
+    def union(self, other: "PairTable") -> "PairTable":
+        """Pairs of either table; reasons are joined and the similarity that is known is kept."""
+        stacked = np.concatenate([self.pairs, other.pairs])
+        pairs, inverse = np.unique(stacked, axis=0, return_inverse=True)
+        reasons = np.zeros(len(pairs), np.uint8)
+        np.bitwise_or.at(reasons, inverse.ravel(), np.concatenate([self.reasons, other.reasons]))
+        similarities = np.full(len(pairs), np.nan, np.float32)
+        known = np.concatenate([self.similarities, other.similarities])
+        there = ~np.isnan(known)
+        similarities[inverse.ravel()[there]] = known[there]
+        return PairTable(pairs, reasons, similarities)
+
+    def take(self, rows: Array) -> "PairTable":
+        """Some of the pairs."""
+        return PairTable(self.pairs[rows], self.reasons[rows], self.similarities[rows])
+
+    def reason_texts(self) -> list[str]:
+        """The reasons of each pair, joined by '+'."""
+        texts = [
+            "+".join(name for bit, name in enumerate(REASONS) if code >> bit & 1)
+            for code in range(1 << len(REASONS))
+        ]
+        return [texts[code] for code in self.reasons]
+
+
+def natural_key(name: str) -> tuple[list[str | int], str]:
+    """Sort key that puts img2 before img10."""
+    parts = re.split(r"(\d+)", name.casefold())
+    return [int(part) if place % 2 else part for place, part in enumerate(parts)], name
+
+
+def exhaustive_pairs(count: int) -> PairTable:
+    """All pairs of ``count`` images."""
+    return PairTable.of(np.column_stack(np.triu_indices(count, 1)), "exhaustive")
+
+
+def sequential_pairs(names: Sequence[str], look_ahead: int) -> PairTable:
+    """Every image with the ``look_ahead`` images that follow it in the natural order of the names."""
+    order = np.array(sorted(range(len(names)), key=lambda row: natural_key(names[row])), dtype=np.int64)
+    steps = range(1, min(look_ahead, len(names) - 1) + 1)
+    pairs = [np.column_stack([order[:-step], order[step:]]) for step in steps]
+    return PairTable.of(np.concatenate(pairs) if pairs else np.zeros((0, 2)), "sequential")
+
+
+def similar_pairs(
+    blocks: Sequence[Array], read_block: Callable[[int], Array], top_k: int, min_score: float
+) -> PairTable:
+    """Every image with the ``top_k`` images that resemble it most.
+
+    The similarity matrix is computed block by block; no more than two blocks of descriptors and one block
+    of similarities are held at a time, and ``top_k`` candidates per image.
+
+    Parameters
+    ----------
+    blocks : image rows (n_a,) of each block.
+    read_block : gives the descriptors (n_a,D) float32 of a block, of unit length or zero.
+    top_k : most partners that an image chooses; it may be chosen by more. Ties go to the smaller row.
+    min_score : least similarity, a dot product; images without features (similarity 0) are never paired.
+    """
+    found: list[Array] = []
+    scores: list[Array] = []
+    for rows in range(len(blocks)):
+        own = read_block(rows)
+        best_ids = np.full((len(own), 0), -1)
+        best = np.full((len(own), 0), np.float32(0))
+        for columns in range(len(blocks)):
+            other = own if columns == rows else read_block(columns)
+            similarity = own @ other.T
+            if columns == rows:
+                np.fill_diagonal(similarity, -np.inf)
+            ids = np.concatenate([best_ids, np.broadcast_to(blocks[columns], similarity.shape)], axis=1)
+            both = np.concatenate([best, similarity], axis=1)
+            order = np.lexsort((ids, -both), axis=1)[:, :top_k]
+            best_ids, best = np.take_along_axis(ids, order, 1), np.take_along_axis(both, order, 1)
+        image, slot = np.nonzero((best >= min_score) & (best > 0))
+        found.append(np.column_stack([blocks[rows][image], best_ids[image, slot]]))
+        scores.append(best[image, slot])
+    pairs = np.concatenate(found) if found else np.zeros((0, 2))
+    return PairTable.of(pairs, "retrieved", np.concatenate(scores) if scores else None)

@@ -1,0 +1,1 @@
+"""Absolute rotations from relative ones, by interchangeable averagers."""

@@ -1,0 +1,119 @@
+"""A robust search, then a refinement weighted by covariances."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from snakesfm.geometry.rotations import log_so3
+from snakesfm.rotation_averaging.base import RotationAverager, RotationGraph, edge_residuals
+from snakesfm.rotation_averaging.irls import IrlsAverager
+from snakesfm.rotation_averaging.linear import apply_increments, solve_anisotropic, world_residuals
+from snakesfm.rotation_averaging.noise import fit_noise, squared_lengths, student_weights
+from snakesfm.rotation_averaging.rejection import residual_limit
+from snakesfm.rotation_averaging.reseat import reseat_nodes
+from snakesfm.rotation_averaging.tree import tree_rotations
+
+Array = NDArray[Any]
+
+REFUSED = 1e-6
+"""Weight of refused edges: none in effect, but the graph stays connected."""
+
+RESEATS = 3
+"""So often nodes are reseated, at most."""
+
+CLEAN = 0.03
+"""Part of the edges that may contradict a start for it to be taken without trying others."""
+
+
+@dataclass(frozen=True)
+class TwoStageAverager(RotationAverager):
+    """Robust averaging blind to covariances, then maximum likelihood with them on the edges that fit.
+
+    A confident outlier spoils a single pass with covariances; after the robust stage it is refused. That
+    stage starts from two spanning trees, by inlier counts and by cycle messages, moves single nodes out of
+    local minima and keeps the result of least robust cost. The covariances are rescaled and floored as the
+    residuals demand, or replaced by inlier counts where these explain the residuals better.
+
+    Parameters
+    ----------
+    robust : steps of the first stage.
+    smallest_limit_rad, largest_limit_rad : bounds of the residual at which an edge is refused.
+    rounds : how often the noise model is fitted.
+    iterations : linear steps per round, at most.
+    """
+
+    robust: IrlsAverager = field(default_factory=IrlsAverager)
+    smallest_limit_rad: float = float(np.radians(8.0))
+    largest_limit_rad: float = float(np.radians(20.0))
+    rounds: int = 3
+    iterations: int = 5
+
+    def solve(self, graph: RotationGraph, seed: int) -> Array:
+        """Rotations (N,3,3) of a connected graph."""
+        averaged = self._search(graph)
+        for _ in range(self.rounds):
+            averaged = self._refine(graph, averaged)
+        return averaged
+
+    def _search(self, graph: RotationGraph) -> Array:
+        """Rotations of the start that leads to the least robust cost."""
+        best, best_cost = np.zeros((0, 3, 3)), np.inf
+        for start in self._starts(graph):
+            averaged = self.robust.descend(graph, self.robust.straighten(graph, start))
+            cost = self.robust.cost(graph, averaged)
+            for _ in range(RESEATS):
+                moved = self.robust.descend(graph, reseat_nodes(graph, averaged, self.robust.scale_rad))
+                moved_cost = self.robust.cost(graph, moved)
+                if moved_cost >= 0.9999 * cost:
+                    break
+                averaged, cost = moved, moved_cost
+            if cost < best_cost:
+                best, best_cost = averaged, cost
+            angles = edge_residuals(graph.pairs, graph.rotations, best)
+            if np.mean(angles > 2.0 * self.robust.scale_rad) <= CLEAN:
+                break
+        return best
+
+    def _starts(self, graph: RotationGraph) -> Iterator[Array]:
+        """Rotations along spanning trees, the cheaper one first."""
+        from snakesfm.view_graph.cycles import find_cycles
+        from snakesfm.view_graph.messages import edge_errors
+
+        yield tree_rotations(graph.node_count, graph.pairs, graph.rotations, 1.0 / graph.weights)
+        cycles = find_cycles(graph.node_count, graph.pairs, graph.rotations)
+        errors = edge_errors(len(graph.pairs), cycles, graph.weights)
+        unknown = np.radians(20.0)
+        noise = np.radians(0.5) * np.sqrt(np.median(graph.weights) / graph.weights)
+        costs = np.where(np.isnan(errors), unknown, errors) + noise
+        yield tree_rotations(graph.node_count, graph.pairs, graph.rotations, costs)
+
+    def _refine(self, graph: RotationGraph, averaged: Array) -> Array:
+        """Maximum likelihood rotations near ``averaged`` under Student t noise."""
+        tails = averaged[graph.pairs[:, 1]]
+        # residuals as left increments of j_from_i, in the frame of camera j, where the covariances are
+        local = log_so3(graph.rotations @ averaged[graph.pairs[:, 0]] @ tails.transpose(0, 2, 1))
+        angles = np.linalg.norm(local, axis=1)
+        fits = angles <= residual_limit(angles, self.smallest_limit_rad, self.largest_limit_rad)
+        if np.count_nonzero(fits) < graph.node_count:
+            return averaged
+        candidates = [np.eye(3) / graph.weights[fits, None, None]]
+        if np.isfinite(graph.covariances[fits]).all():
+            candidates.append(graph.covariances[fits])
+        information = np.tile(np.eye(3), (len(fits), 1, 1))
+        information[fits] = np.linalg.inv(fit_noise(local[fits], candidates)[0])
+        information[~fits] *= REFUSED * np.median(information[fits, 0, 0])
+        for _ in range(self.iterations):
+            residuals = world_residuals(graph.pairs, graph.rotations, averaged)
+            tails = averaged[graph.pairs[:, 1]]
+            turned = tails.transpose(0, 2, 1) @ information @ tails
+            weights = student_weights(squared_lengths(residuals, turned))
+            increments = solve_anisotropic(
+                graph.node_count, graph.pairs, weights[:, None, None] * turned, residuals
+            )
+            averaged = apply_increments(averaged, increments)
+            if np.linalg.norm(increments, axis=1).max() < 1e-4:
+                break
+        return averaged

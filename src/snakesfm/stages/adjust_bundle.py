@@ -1,0 +1,119 @@
+"""Stage adjust_bundle: cameras, poses and points adjusted together."""
+
+import numpy as np
+
+from snakesfm.artifacts.gather import gather_image_columns, gather_inlier_matches
+from snakesfm.artifacts.images import CalibratedCameras, ImageIndex
+from snakesfm.artifacts.mapping import CameraCenters, CameraRotations, Reconstruction, TriangulatedPoints
+from snakesfm.artifacts.pairs import ViewGraph
+from snakesfm.bundle.completion import correspondence_graph
+from snakesfm.bundle.interface import SolverSettings
+from snakesfm.bundle.model import BundleModel, from_reconstruction, reprojection_errors, to_reconstruction
+from snakesfm.bundle.rounds import RoundRecord, RoundSettings, adjust_rounds, mean_point_errors
+from snakesfm.config.adjust_bundle import AdjustBundleOptions
+from snakesfm.errors import SceneError
+from snakesfm.geometry.camera import cameras_from_columns, cameras_to_columns
+from snakesfm.geometry.poses import translation_of
+from snakesfm.stages.job import StageJob
+from snakesfm.triangulation.tracks import mean_colors
+
+
+def run(job: StageJob) -> None:
+    """Adjust the model in rounds and write the reconstruction.
+
+    Raises
+    ------
+    SceneError : fewer than two images are left.
+    """
+    options: AdjustBundleOptions = job.options
+    index = ImageIndex.read(job.path("index"))
+    columns = CalibratedCameras.read(job.path("cameras"))
+    cameras = cameras_from_columns(columns.models, columns.sizes, columns.params, columns.sources)
+    rotations = CameraRotations.read(job.path("rotations")).rotations
+    centers = CameraCenters.read(job.path("centers")).centers
+    start = TriangulatedPoints.read(job.path("points"))
+    keypoints, colors = gather_image_columns(job.paths("features"), len(index.names), "keypoints", "colors")
+    model = BundleModel(
+        tuple(cameras),
+        index.camera_ids,
+        rotations,
+        translation_of(rotations, centers),
+        start.points,
+        start.offsets,
+        start.image_ids,
+        start.keypoint_ids,
+    )
+    reconstruction = to_reconstruction(model, keypoints, index.names.tolist())
+    pairs = _usable_pairs(ViewGraph.read(job.path("graph")), model)
+    graph = correspondence_graph(keypoints, *gather_inlier_matches(job.paths("geometries"), pairs))
+    fixed = job.settings.get("intrinsics", "fixed") == "fixed"
+    solving = SolverSettings(
+        loss=options.loss,
+        loss_scale_px=options.loss_scale_px,
+        constant_cameras=frozenset(
+            row + 1 for row, camera in enumerate(cameras) if fixed and camera.source == "given"
+        ),
+        refine_focal=options.refine_focal,
+        refine_distortion=options.refine_distortion,
+        max_iterations=options.max_iterations,
+        function_tolerance=options.function_tolerance,
+    )
+    shared = options.model_dump(include=set(RoundSettings.__dataclass_fields__))
+    posed = int(np.isfinite(model.rotations[:, 0, 0] + model.translations[:, 0]).sum())
+    shared["min_track_length"] = min(options.min_track_length, max(2, posed))
+    settings = RoundSettings(**shared, seed=job.seed_for("bundle"))
+    records = adjust_rounds(reconstruction, graph, cameras, solving, settings, _print_record)
+    result = from_reconstruction(reconstruction, model)
+    if np.isfinite(result.rotations[:, 0, 0]).sum() < 2:
+        raise SceneError(
+            f"Scene '{job.scene}': bundle adjustment kept fewer than two images: the averaged poses do not "
+            "fit the tracks; check the cameras' focal lengths, or lower adjust_bundle.min_observations."
+        )
+    _write(job, result, keypoints, colors, records)
+
+
+def _usable_pairs(graph: ViewGraph, model: BundleModel) -> np.ndarray:
+    """Edges that the filters kept, and all edges of images that averaging left out."""
+    posed = np.isfinite(model.rotations[:, 0, 0]) & np.isfinite(model.translations[:, 0])
+    usable: np.ndarray = graph.pairs[(graph.labels == 0) | ~posed[graph.pairs].all(axis=1)]
+    return usable
+
+
+def _print_record(record: RoundRecord) -> None:
+    images, points, observations = record.counts
+    print(
+        f"{record.name}: cost {record.costs[0]:.1f} -> {record.costs[1]:.1f}, {images} images, "
+        f"{points} points, {observations} observations, mean error {record.error_px:.3f} px",
+        flush=True,
+    )
+
+
+def _write(
+    job: StageJob,
+    model: BundleModel,
+    keypoints: list[np.ndarray],
+    colors: list[np.ndarray],
+    records: list[RoundRecord],
+) -> None:
+    base = np.r_[0, np.cumsum([len(k) for k in keypoints])]
+    rows = base[model.image_ids] + model.keypoint_ids
+    observed = np.concatenate(keypoints)[rows]
+    models, sizes, params, _ = cameras_to_columns(model.cameras)
+    Reconstruction(
+        camera_models=np.array(models),
+        camera_sizes=sizes,
+        camera_params=params,
+        rotations=model.rotations,
+        translations=model.translations,
+        points=model.points,
+        colors=mean_colors(np.concatenate(colors)[rows], model.offsets),
+        errors_px=mean_point_errors(reprojection_errors(model, observed), model.offsets),
+        offsets=model.offsets,
+        image_ids=model.image_ids,
+        keypoint_ids=model.keypoint_ids,
+        keypoints=observed,
+        round_names=np.array([record.name for record in records]),
+        round_costs=np.array([record.costs for record in records]),
+        round_counts=np.array([record.counts for record in records]),
+        round_errors_px=np.array([record.error_px for record in records]),
+    ).write(job.output, job.header)

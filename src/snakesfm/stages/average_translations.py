@@ -1,0 +1,129 @@
+"""Stage average_translations: camera centres from averaged rotations, the view graph and the tracks."""
+
+import numpy as np
+
+from snakesfm.artifacts.base import Array
+from snakesfm.artifacts.images import CalibratedCameras, ImageIndex
+from snakesfm.artifacts.mapping import CameraCenters, CameraRotations, TrackTable
+from snakesfm.artifacts.pairs import KINDS, ViewGraph
+from snakesfm.config.average_translations import AverageTranslationsOptions
+from snakesfm.errors import SceneError
+from snakesfm.geometry.camera import cameras_from_columns
+from snakesfm.stages.job import StageJob
+from snakesfm.translation_averaging.average import average_translations
+from snakesfm.translation_averaging.averagers import (
+    GlobalPositioning,
+    ScaleChain,
+    TranslationAverager,
+    TranslationRecovery,
+)
+from snakesfm.translation_averaging.problem import PositioningProblem, edge_directions, world_rays
+from snakesfm.translation_averaging.support import SupportLimits
+
+
+def run(job: StageJob) -> None:
+    """Position the images that have a rotation.
+
+    Edges take part that every filter kept and whose translation has a direction; rays of the tracks take
+    part as far as ``rays_per_camera`` allows.
+
+    Raises
+    ------
+    SceneError : fewer than two images get a centre.
+    """
+    options: AverageTranslationsOptions = job.options
+    index = ImageIndex.read(job.path("index"))
+    columns = CalibratedCameras.read(job.path("cameras"))
+    cameras = cameras_from_columns(columns.models, columns.sizes, columns.params, columns.sources)
+    graph = ViewGraph.read(job.path("graph"))
+    averaged = CameraRotations.read(job.path("rotations"))
+    tracks = TrackTable.read(job.path("tracks"))
+    rotations = averaged.rotations
+    turned = np.isfinite(rotations[:, 0, 0])
+
+    usable = (
+        (graph.labels == 0) & (averaged.labels == 0) & turned[graph.pairs[:, 0]] & turned[graph.pairs[:, 1]]
+    )
+    usable &= (graph.kinds != KINDS.index("rotation_only")) & np.isfinite(graph.translations[:, 0])
+    track_ids = np.repeat(np.arange(len(tracks.offsets) - 1), np.diff(tracks.offsets))
+    rows = turned[tracks.image_ids]
+    normalized = np.zeros((len(rows), 2))
+    for camera_id, camera in enumerate(cameras):
+        mine = index.camera_ids[tracks.image_ids] == camera_id
+        normalized[mine] = camera.normalize(tracks.keypoints[mine])
+    rows &= np.isfinite(normalized.sum(axis=1))
+    pairs = graph.pairs[usable].astype(np.int64)
+    images = tracks.image_ids[rows].astype(np.int64)
+    problem = PositioningProblem(
+        image_count=len(index.names),
+        pairs=pairs,
+        directions=edge_directions(rotations, pairs, graph.translations[usable]),
+        sigmas_rad=_direction_sigmas(graph.covariances[usable]),
+        ray_images=images,
+        ray_tracks=track_ids[rows],
+        rays=world_rays(rotations, images, normalized[rows]),
+    )
+    limits = SupportLimits(
+        sigma_rad=float(np.radians(options.ray_sigma_deg)),
+        edge_rad=float(np.radians(options.max_edge_residual_deg)),
+        min_support=options.min_support,
+        min_ratio=options.min_support_ratio,
+        max_relative_sigma=options.max_relative_sigma,
+    )
+    result = average_translations(
+        problem,
+        _averager(options),
+        limits,
+        refine=options.refine,
+        rays_per_camera=options.rays_per_camera,
+        edge_weight=options.edge_weight,
+        seed=job.seed_for("positions"),
+    )
+    placed = int(np.isfinite(result.centers[:, 0]).sum())
+    if placed < 2:
+        raise SceneError(
+            f"Scene '{job.scene}': no two images could be positioned from {len(pairs)} image pairs and "
+            f"{len(tracks.offsets) - 1} tracks: add images taken from different places with more overlap."
+        )
+    residuals = np.full(len(graph.pairs), np.nan)
+    residuals[usable] = np.degrees(result.edge_residuals_rad)
+    print(
+        f"{placed} of {turned.sum()} images with a rotation are positioned; median residuals: edges "
+        f"{_median(residuals):.2f} deg, rays {_median(np.degrees(result.ray_residuals_rad)):.2f} deg"
+    )
+    CameraCenters(
+        centers=result.centers,
+        edge_residuals_deg=residuals,
+        edge_used=residuals < options.max_edge_residual_deg,
+        ray_track_ids=result.ray_tracks,
+        ray_residuals_deg=np.degrees(result.ray_residuals_rad),
+    ).write(job.output, job.header)
+
+
+def _averager(options: AverageTranslationsOptions) -> TranslationAverager:
+    if options.method == "translation_recovery":
+        return TranslationRecovery(
+            rays_per_camera=options.recovery_rays_per_camera,
+            sigma=options.recovery_sigma,
+            reject_outliers=options.reject_outliers,
+            residual_rad=float(np.radians(options.max_edge_residual_deg)),
+            mfas_projections=options.mfas_projections,
+            mfas_weight=options.mfas_weight,
+        )
+    if options.method == "global_positioning":
+        return GlobalPositioning(
+            options.rays_per_camera, options.positioning_loss_scale, options.positioning_start
+        )
+    return ScaleChain(options.rays_per_camera, float(np.radians(options.ray_sigma_deg)))
+
+
+def _direction_sigmas(covariances: Array) -> Array:
+    """Standard deviations (E) in radians of the translations' directions; 5 degrees where unknown."""
+    variances = (covariances[:, 3, 3] + covariances[:, 4, 4]) / 2.0
+    known = np.isfinite(variances) & (variances > 0)
+    return np.where(known, np.sqrt(np.where(known, variances, 1.0)), np.radians(5.0))
+
+
+def _median(values: Array) -> float:
+    values = values[np.isfinite(values)]
+    return float(np.median(values)) if len(values) else float("nan")

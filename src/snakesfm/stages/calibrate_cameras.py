@@ -1,0 +1,108 @@
+"""Stage calibrate_cameras: focal lengths that nobody gave, from the matches."""
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from snakesfm.artifacts.features import LocalFeatures
+from snakesfm.artifacts.images import CalibratedCameras, ImageIndex
+from snakesfm.artifacts.pairs import PairMatches
+from snakesfm.config.calibrate_cameras import CalibrateCamerasOptions
+from snakesfm.geometry.camera import Camera, cameras_from_columns, cameras_to_columns
+from snakesfm.stages.job import StageJob
+
+Array = NDArray[Any]
+GIVEN_SIGMA = 0.0
+
+
+def run(job: StageJob) -> None:
+    """Estimate the focal lengths that are not given; cameras that are given pass unchanged."""
+    options: CalibrateCamerasOptions = job.options
+    index = ImageIndex.read(job.path("index"))
+    cameras = cameras_from_columns(
+        index.camera_models, index.camera_sizes, index.camera_params, index.camera_sources
+    )
+    given = np.array([camera.source == "given" for camera in cameras], dtype=bool)
+    sigmas = np.where(given, GIVEN_SIGMA, np.nan)
+    counts = np.zeros(len(cameras), dtype=np.int32)
+    if options.estimate_focals and not given.all():
+        cameras, sigmas, counts = _calibrate(job, index, cameras, options)
+    models, sizes, params, sources = cameras_to_columns(cameras)
+    CalibratedCameras(
+        np.array(models, dtype=object), sizes, params, np.array(sources, dtype=object), sigmas, counts
+    ).write(job.output, job.header)
+    print(_summary(cameras), flush=True)
+
+
+def _calibrate(
+    job: StageJob, index: ImageIndex, cameras: list[Camera], options: CalibrateCamerasOptions
+) -> tuple[list[Camera], Array, Array]:
+    # not needed where all cameras are given
+    from snakesfm.calibration.focal import MatchedPair, calibrate_focals, choose_pairs
+
+    given = np.array([camera.source == "given" for camera in cameras], dtype=bool)
+    candidates, places = _read_counts(job.paths("matches"))
+    chosen = choose_pairs(
+        candidates[:, :2],
+        candidates[:, 2],
+        index.camera_ids,
+        ~given,
+        options.pairs_per_camera,
+        options.min_matches,
+    )
+    keypoints = _read_keypoints(job.paths("features"), set(candidates[chosen, :2].ravel().tolist()))
+    progress = job.progress(len(chosen), "pairs")
+    pairs = []
+    for row in chosen.tolist():
+        i, j = candidates[row, :2].tolist()
+        if i in keypoints and j in keypoints:
+            path, start, stop = places[row]
+            with PairMatches.open(path) as file:
+                matches = file["matches"][start:stop]
+            pairs.append(
+                MatchedPair(
+                    int(index.camera_ids[i]),
+                    int(index.camera_ids[j]),
+                    keypoints[i][matches[:, 0]],
+                    keypoints[j][matches[:, 1]],
+                    job.seed_for(str(index.names[i]), str(index.names[j])),
+                )
+            )
+        progress.step()
+    result = calibrate_focals(pairs, cameras, options)
+    return result.cameras, result.sigmas, result.pair_counts
+
+
+def _read_counts(paths: Iterable[Path]) -> tuple[Array, list[tuple[Path, int, int]]]:
+    """Rows (i, j, matches) of all pairs (P,3), sorted by i and j, and where the matches of each lie."""
+    rows: list[tuple[int, int, int]] = []
+    places: list[tuple[Path, int, int]] = []
+    for path in paths:
+        with PairMatches.open(path) as file:
+            offsets = file["offsets"][()].tolist()
+            for k, (i, j) in enumerate(file["pairs"][()].tolist()):
+                rows.append((i, j, offsets[k + 1] - offsets[k]))
+                places.append((path, offsets[k], offsets[k + 1]))
+    order = sorted(range(len(rows)), key=rows.__getitem__)
+    table = np.array([rows[k] for k in order], dtype=np.int64).reshape(-1, 3)
+    return table, [places[k] for k in order]
+
+
+def _read_keypoints(paths: Iterable[Path], images: set[int]) -> dict[int, Array]:
+    keypoints: dict[int, Array] = {}
+    for path in paths:
+        with LocalFeatures.open(path) as file:
+            offsets = file["offsets"][()]
+            for row, image in enumerate(file["image_ids"][()].tolist()):
+                if image in images:
+                    keypoints[image] = file["keypoints"][offsets[row] : offsets[row + 1]]
+    return keypoints
+
+
+def _summary(cameras: list[Camera]) -> str:
+    sources = sorted({camera.source for camera in cameras})
+    counts = ", ".join(f"{sum(c.source == s for c in cameras)} {s}" for s in sources)
+    return f"calibrate_cameras: {len(cameras)} cameras, focal lengths {counts or 'none'}"

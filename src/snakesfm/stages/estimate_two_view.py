@@ -1,0 +1,169 @@
+"""Stage estimate_two_view: matches of a tile become relative poses with inliers."""
+
+import hashlib
+import json
+from collections import Counter
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from snakesfm.artifacts.features import LocalFeatures
+from snakesfm.artifacts.images import CalibratedCameras, ImageIndex
+from snakesfm.artifacts.pairs import KINDS, REJECTIONS, PairMatches, TwoViewGeometries
+from snakesfm.config.estimate_two_view import EstimateTwoViewOptions
+from snakesfm.errors import ArtifactError
+from snakesfm.geometry.camera import Camera, cameras_from_columns
+from snakesfm.stages.job import StageJob
+from snakesfm.two_view.estimate import TwoViewEstimate, estimate_two_view_geometry
+
+Array = NDArray[Any]
+Row = dict[str, Any]
+
+
+def run(job: StageJob) -> None:
+    """Estimate every pair of the tile whose inputs have changed, and write all of them."""
+    options: EstimateTwoViewOptions = job.options
+    index = ImageIndex.read(job.path("index"))
+    cameras = CalibratedCameras.read(job.path("cameras"))
+    of_camera = cameras_from_columns(cameras.models, cameras.sizes, cameras.params, cameras.sources)
+    matches = PairMatches.read(job.path("matches"))
+    keypoints, image_digests = _read_keypoints(job.paths("features"), set(matches.pairs.ravel().tolist()))
+    former = _read_former(job.former)
+    progress = job.progress(len(matches.pairs), "pairs")
+    rows: list[Row] = []
+    reused = 0
+    for k, (i, j) in enumerate(matches.pairs.tolist()):
+        for image in (i, j):
+            if image not in keypoints:
+                raise ArtifactError(
+                    f"{job.path('matches')} names image {index.names[image]}, which no features file "
+                    "holds: delete both and run again."
+                )
+        pair_matches = matches.matches[matches.offsets[k] : matches.offsets[k + 1]]
+        camera_i, camera_j = (of_camera[index.camera_ids[image]] for image in (i, j))
+        seed = job.seed_for(str(index.names[i]), str(index.names[j]))
+        digest = _digest(
+            pair_matches, (image_digests[i], image_digests[j]), (camera_i, camera_j), options, seed
+        )
+        row = former.get(digest)
+        if row is None:
+            estimate = estimate_two_view_geometry(
+                keypoints[i], keypoints[j], pair_matches, camera_i, camera_j, options, seed
+            )
+            row = _to_row(estimate)
+        else:
+            reused += 1
+        rows.append(row | {"digests": digest})
+        progress.step()
+    _assemble(matches.pairs, rows).write(job.output, job.header)
+    print(_summary(rows, reused), flush=True)
+
+
+def _read_keypoints(paths: Iterable[Path], images: set[int]) -> tuple[dict[int, Array], dict[int, str]]:
+    keypoints: dict[int, Array] = {}
+    digests: dict[int, str] = {}
+    for path in paths:
+        with LocalFeatures.open(path) as file:
+            ids, offsets = file["image_ids"][()], file["offsets"][()]
+            names = file["digests"].asstr()[()]
+            flat = file["keypoints"][()]
+            for row, image in enumerate(ids.tolist()):
+                if image in images:
+                    keypoints[image] = flat[offsets[row] : offsets[row + 1]]
+                    digests[image] = str(names[row])
+    return keypoints, digests
+
+
+def _digest(
+    matches: Array,
+    image_digests: tuple[str, str],
+    cameras: tuple[Camera, Camera],
+    options: EstimateTwoViewOptions,
+    seed: int,
+) -> str:
+    """Digest of all that a pair's result depends on."""
+    named = {
+        "images": image_digests,
+        # the source of a focal length does not change the geometry
+        "cameras": [(c.model, c.width, c.height, c.params) for c in cameras],
+        "options": options.canonical_json(),
+        "stage_version": options.stage_version,
+        "seed": seed,
+    }
+    text = json.dumps(named, sort_keys=True).encode()
+    return hashlib.sha256(text + np.ascontiguousarray(matches, dtype="<i4").tobytes()).hexdigest()
+
+
+def _to_row(estimate: TwoViewEstimate) -> Row:
+    return {
+        "rotations": estimate.rotation,
+        "translations": estimate.translation,
+        "covariances": estimate.covariance,
+        "kinds": KINDS.index(estimate.kind),
+        "rejections": REJECTIONS.index(estimate.rejection),
+        "match_counts": estimate.match_count,
+        "inlier_counts": len(estimate.inliers),
+        "inlier_ratios": estimate.inlier_ratio,
+        "triangulation_angles_deg": estimate.triangulation_angle_deg,
+        "inliers": estimate.inliers,
+    }
+
+
+COLUMNS: dict[str, tuple[tuple[int, ...], str]] = {
+    "rotations": ((3, 3), "float64"),
+    "translations": ((3,), "float64"),
+    "covariances": ((5, 5), "float64"),
+    "kinds": ((), "int8"),
+    "rejections": ((), "int8"),
+    "match_counts": ((), "int32"),
+    "inlier_counts": ((), "int32"),
+    "inlier_ratios": ((), "float64"),
+    "triangulation_angles_deg": ((), "float64"),
+}
+
+
+def _read_former(path: Path | None) -> dict[str, Row]:
+    """Results of an earlier run by their digest; nothing where it cannot be read."""
+    if path is None:
+        return {}
+    try:
+        former = TwoViewGeometries.read(path)
+    except ArtifactError:
+        return {}
+    rows: dict[str, Row] = {}
+    for k, digest in enumerate(former.digests):
+        row: Row = {name: getattr(former, name)[k] for name in COLUMNS}
+        row["inliers"] = former.inliers[former.offsets[k] : former.offsets[k + 1]]
+        rows[str(digest)] = row
+    return rows
+
+
+def _assemble(pairs: Array, rows: list[Row]) -> TwoViewGeometries:
+    columns = {
+        name: np.array([row[name] for row in rows], dtype=dtype).reshape(len(rows), *shape)
+        for name, (shape, dtype) in COLUMNS.items()
+    }
+    counts = [len(row["inliers"]) for row in rows]
+    inliers = [row["inliers"] for row in rows]
+    return TwoViewGeometries(
+        pairs=pairs,
+        digests=np.array([row["digests"] for row in rows], dtype=object),
+        offsets=np.concatenate([[0], np.cumsum(counts)]).astype(np.int64),
+        inliers=np.concatenate(inliers) if inliers else np.zeros((0, 2), dtype=np.int32),
+        **columns,
+    )
+
+
+def _summary(rows: list[Row], reused: int) -> str:
+    reasons = Counter(REJECTIONS[int(row["rejections"])] for row in rows)
+    kinds = Counter(KINDS[int(row["kinds"])] for row in rows if int(row["rejections"]) == 0)
+    accepted = reasons.pop("", 0)
+    parts = [f"{accepted} of {len(rows)} pairs accepted"]
+    parts += [f"{kinds[kind]} {kind}" for kind in KINDS[1:] if kinds[kind]]
+    parts += [f"{reasons[reason]} {reason}" for reason in REJECTIONS if reasons.get(reason)]
+    if reused:
+        parts.append(f"{reused} unchanged and taken over")
+    return "estimate_two_view: " + ", ".join(parts)

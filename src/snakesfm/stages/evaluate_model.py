@@ -1,0 +1,58 @@
+"""evaluate_model: the model's metrics, against a reference where there is one."""
+
+from pathlib import Path
+from typing import Any
+
+from snakesfm.artifacts import ImageIndex, Reconstruction, atomic_path, write_json
+from snakesfm.config.evaluate_model import EvaluateModelOptions
+from snakesfm.evaluation.metrics import PoseEvaluation, Poses, evaluate_poses, model_metrics
+from snakesfm.stages.job import StageJob
+
+
+def run(job: StageJob) -> None:
+    """Write metrics.json and, where it is among the outputs, its scalars as one row of metrics.csv."""
+    index = ImageIndex.read(job.path("index"))
+    model = Reconstruction.read(job.path("reconstruction"))
+    poses = Poses([str(name) for name in index.names], model.rotations, model.translations)
+    row: dict[str, Any] = {"scene": job.scene}
+    row |= model_metrics(poses.registered, model.offsets, model.errors_px)
+    content: dict[str, Any] = dict(row)
+    reference = str(job.settings.get("reference") or "")
+    if reference:
+        from snakesfm.evaluation.colmap_model import model_poses, read_model
+
+        options: EvaluateModelOptions = job.options
+        evaluation = evaluate_poses(
+            poses,
+            model_poses(read_model(Path(reference).expanduser())),
+            options.relative_thresholds_deg,
+            options.global_thresholds_deg,
+            options.min_baseline_ratio,
+        )
+        row |= evaluation.metrics
+        content = {**row, "reference": reference, "per_image": _per_image(evaluation)}
+    for path in job.outputs:
+        if path.suffix == ".csv":
+            _write_csv(path, row)
+    write_json(job.output, content)
+
+
+def _per_image(evaluation: PoseEvaluation) -> dict[str, dict[str, float | None]]:
+    columns = {
+        "rotation_error_deg": evaluation.rotation_deg.tolist(),
+        "translation_angle_deg": evaluation.direction_deg.tolist(),
+        "position_error": evaluation.position.tolist(),
+    }
+    return {
+        name: {key: None if values[k] != values[k] else values[k] for key, values in columns.items()}
+        for k, name in enumerate(evaluation.names)
+    }
+
+
+def _write_csv(path: Path, row: dict[str, Any]) -> None:
+    import csv
+
+    with atomic_path(path) as temporary, temporary.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(row)
+        writer.writerow("" if value is None else value for value in row.values())

@@ -1,0 +1,92 @@
+"""export_model: the adjusted model as COLMAP model, PLY and transforms.json."""
+
+import json
+import shutil
+import sys
+import tempfile
+from pathlib import Path
+
+from snakesfm.artifacts import ImageIndex, Reconstruction
+from snakesfm.config.export_model import ExportModelOptions
+from snakesfm.export.colmap import build_reconstruction, registered_images, summarize
+from snakesfm.export.image_folder import place_images
+from snakesfm.export.nerfstudio import camera_warnings, transforms
+from snakesfm.export.undistorted import write_undistorted
+from snakesfm.geometry.camera import cameras_from_columns
+from snakesfm.stages.job import StageJob
+
+SUMMARY = "summary.json"
+UNDISTORTED = "undistorted"
+TEMPORARY = ".export."
+SPACES = (
+    "Some image names hold spaces, at which COLMAP cuts names when it reads images.txt: use the .bin files."
+)
+
+
+def run(job: StageJob) -> None:
+    """Write the files that ``job.outputs`` names, complete or not at all, summary.json last."""
+    index = ImageIndex.read(job.path("index"))
+    model = Reconstruction.read(job.path("reconstruction"))
+    cameras = cameras_from_columns(model.camera_models, model.camera_sizes, model.camera_params)
+    names = [str(name) for name in index.names]
+    registered = registered_images(model.rotations, model.translations)
+    used = sorted({int(index.camera_ids[row]) for row in registered})
+    warnings = [line for row in used for line in camera_warnings(cameras[row], row + 1)]
+    if any(" " in names[row] for row in registered):
+        warnings.append(SPACES)
+    for line in warnings:
+        sys.stderr.write(f"warning: {line}\n")
+    folder = _export_folder(job)
+    folder.mkdir(parents=True, exist_ok=True)
+    for leftover in folder.glob(f"{TEMPORARY}*"):
+        shutil.rmtree(leftover)
+    with tempfile.TemporaryDirectory(prefix=TEMPORARY, dir=folder) as name:
+        temporary = Path(name)
+        sparse = temporary / "sparse" / "0"
+        sparse.mkdir(parents=True)
+        colmap = build_reconstruction(
+            names,
+            index.camera_ids,
+            cameras,
+            model.rotations,
+            model.translations,
+            model.points,
+            model.colors,
+            model.errors_px,
+            model.offsets,
+            model.image_ids,
+            model.keypoints,
+        )
+        colmap.write_binary(str(sparse))
+        colmap.write_text(str(sparse))
+        colmap.export_PLY(str(temporary / "points.ply"))
+        content = transforms(
+            names, index.camera_ids, cameras, model.rotations, model.translations, registered
+        )
+        _write_json(temporary / "transforms.json", content)
+        summary = summarize(job.scene, names, registered, model.offsets, model.errors_px, warnings)
+        _write_json(temporary / SUMMARY, summary)
+        options: ExportModelOptions = job.options
+        if options.link_images or options.undistort:
+            place_images(folder / "images", Path(job.settings["images"]), names, index.orientations)
+        if options.undistort:
+            write_undistorted(temporary / UNDISTORTED, sparse, folder / "images", job.threads)
+        shutil.rmtree(folder / UNDISTORTED, ignore_errors=True)
+        _publish(temporary, folder)
+
+
+def _export_folder(job: StageJob) -> Path:
+    """The folder that holds summary.json, whichever place it has among the outputs."""
+    return next((path.parent for path in job.outputs if path.name == SUMMARY), job.output.parent)
+
+
+def _write_json(path: Path, content: object) -> None:
+    path.write_text(json.dumps(content, indent=1, ensure_ascii=False) + "\n", "utf-8")
+
+
+def _publish(temporary: Path, folder: Path) -> None:
+    """Rename every finished file into place; the summary, which says that all is there, last."""
+    files = sorted(path.relative_to(temporary) for path in temporary.rglob("*") if path.is_file())
+    for file in sorted(files, key=lambda file: file.name == SUMMARY):
+        (folder / file).parent.mkdir(parents=True, exist_ok=True)
+        (temporary / file).replace(folder / file)

@@ -1,0 +1,130 @@
+"""Find and describe keypoints in the images of one block."""
+
+import hashlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from snakesfm.artifacts.features import LocalFeatures
+from snakesfm.artifacts.images import ImageIndex
+from snakesfm.config.extract_features import ExtractFeaturesOptions
+from snakesfm.errors import ArtifactError, ImageError
+from snakesfm.features.extraction import create_detector, extract_keypoints, sample_colors
+from snakesfm.features.keypoints import Detector, KeypointSet
+from snakesfm.ingest.read import read_image
+from snakesfm.stages.job import StageJob
+
+Array = NDArray[Any]
+
+
+@dataclass(frozen=True)
+class ColoredKeypoints:
+    """Keypoints of one image and the image's colour (N,3) uint8 at each."""
+
+    points: KeypointSet
+    colors: Array
+
+
+def run(job: StageJob) -> None:
+    """Read the block's images one by one and write their LocalFeatures.
+
+    An image that cannot be decoded gets no keypoints and a warning; the others go on.
+    """
+    cv2.setNumThreads(job.threads)
+    options: ExtractFeaturesOptions = job.options
+    index = ImageIndex.read(job.path("index"))
+    rows = np.flatnonzero(index.blocks == int(job.settings["block"]))
+    folder = Path(job.settings["images"])
+    detector = create_detector(
+        options.method,
+        contrast_threshold=options.contrast_threshold,
+        edge_threshold=options.edge_threshold,
+        upright=options.upright,
+    )
+    digests = [_digest(str(index.sha256[row]), options) for row in rows]
+    former = _read_former(job.former, set(digests))
+    progress = job.progress(len(rows), "images")
+    results = []
+    for row, digest in zip(rows, digests, strict=True):
+        result = former.get(digest)
+        if result is None:
+            result = _extract(folder, str(index.names[row]), detector, options)
+        results.append(result)
+        progress.step()
+    _collect(index, rows, digests, results, detector).write(job.output, job.header)
+    counts = [len(result.points) for result in results]
+    reused = sum(digest in former for digest in digests)
+    print(
+        f"{len(rows)} images ({reused} taken over), {sum(counts)} keypoints, "
+        f"median {int(np.median(counts)) if counts else 0} per image"
+    )
+
+
+def _digest(sha256: str, options: ExtractFeaturesOptions) -> str:
+    text = "\0".join((sha256, options.canonical_json(), str(options.stage_version)))
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def _extract(
+    folder: Path, name: str, detector: Detector, options: ExtractFeaturesOptions
+) -> ColoredKeypoints:
+    try:
+        image = read_image(folder / name, options.max_shorter_side_px)
+    except ImageError as error:
+        print(f"warning: {error}")
+        nothing = KeypointSet.empty(detector.descriptor_size, detector.descriptor_dtype)
+        return ColoredKeypoints(nothing, np.zeros((0, 3), np.uint8))
+    points = extract_keypoints(
+        detector, image.gray, image.rgb, options.max_keypoints, options.max_shorter_side_px
+    )
+    colors = sample_colors(image.rgb, points.keypoints)
+    return ColoredKeypoints(points.scaled(image.reduction, image.reduction), colors)
+
+
+def _read_former(path: Path | None, wanted: set[str]) -> Mapping[str, ColoredKeypoints]:
+    """What an earlier file holds of the images that are unchanged, by digest."""
+    if path is None:
+        return {}
+    try:
+        former = LocalFeatures.read(path)
+    except ArtifactError:
+        return {}
+    taken = {}
+    for row, digest in enumerate(former.digests):
+        if digest in wanted:
+            part = slice(former.offsets[row], former.offsets[row + 1])
+            points = KeypointSet(
+                former.keypoints[part],
+                former.descriptors[part],
+                former.scores[part],
+                former.scales[part],
+                former.angles[part],
+            )
+            taken[str(digest)] = ColoredKeypoints(points, former.colors[part])
+    return taken
+
+
+def _collect(
+    index: ImageIndex, rows: Array, digests: list[str], results: list[ColoredKeypoints], detector: Detector
+) -> LocalFeatures:
+    # an empty set in front keeps shapes and dtypes where the block has no image
+    points = [KeypointSet.empty(detector.descriptor_size, detector.descriptor_dtype)]
+    points += [result.points for result in results]
+    colors = [np.zeros((0, 3), np.uint8), *(result.colors for result in results)]
+    return LocalFeatures(
+        image_ids=rows,
+        names=index.names[rows],
+        digests=np.array(digests, dtype=object),
+        offsets=np.cumsum([len(part) for part in points]),
+        keypoints=np.concatenate([part.keypoints for part in points]),
+        descriptors=np.concatenate([part.descriptors for part in points]),
+        scores=np.concatenate([part.scores for part in points]),
+        scales=np.concatenate([part.scales for part in points]),
+        angles=np.concatenate([part.angles for part in points]),
+        colors=np.concatenate(colors),
+    )

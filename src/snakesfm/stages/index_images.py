@@ -1,0 +1,142 @@
+"""index_images: which images there are, and which cameras took them."""
+
+from collections import Counter
+from collections.abc import Iterable
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+
+from snakesfm.artifacts.images import ImageIndex
+from snakesfm.config.index_images import IndexImagesOptions
+from snakesfm.errors import ImageError, SceneError
+from snakesfm.geometry.camera import cameras_to_columns
+from snakesfm.ingest.cameras import ImageCameras, Photograph, assign_cameras
+from snakesfm.ingest.discover import digest_images, list_images
+from snakesfm.ingest.known import match_known_cameras, read_known_cameras
+from snakesfm.ingest.read import read_header
+from snakesfm.seeding import block_of
+from snakesfm.stages.job import StageJob
+
+DIGESTS_NAME = "digests.json"
+
+
+def run(job: StageJob) -> None:
+    """Index the images of a folder and write the ImageIndex.
+
+    Settings: ``images`` (folder), ``cameras`` (known intrinsics, or "") and ``blocks``.
+
+    Raises
+    ------
+    ConfigError : the folder cannot be listed, or the known intrinsics are wrong.
+    SceneError : fewer than two different images can be used.
+    """
+    options: IndexImagesOptions = job.options
+    folder = Path(job.settings["images"])
+    known = read_known_cameras(job.settings["cameras"]) if job.settings.get("cameras") else None
+    names = list_images(folder)
+    digests = digest_images(folder, names, job.output.parent / DIGESTS_NAME, job.threads)
+    photographs, refused = _read_headers(job, folder, names)
+    _check_scene(folder, names, {digests[p.name] for p in photographs}, refused)
+    sizes = [(p.width, p.height) for p in photographs]
+    found = assign_cameras(
+        photographs,
+        match_known_cameras(known, [p.name for p in photographs], sizes)
+        if known
+        else [None] * len(photographs),
+        sharing=options.camera_sharing,
+        model=options.camera_model,
+        default_focal_ratio=options.default_focal_ratio,
+        use_exif=options.use_exif_focal,
+    )
+    index = _to_index(photographs, [digests[p.name] for p in photographs], found, refused, job)
+    index.write(job.output, job.header)
+    _report(index)
+
+
+def _read_headers(job: StageJob, folder: Path, names: list[str]) -> tuple[list[Photograph], dict[str, str]]:
+    """The usable images, and the others' names with the reason in one sentence."""
+    progress = job.progress(len(names), "images")
+
+    def read(name: str) -> Photograph | str:
+        try:
+            name.encode("utf-8")
+            header = read_header(folder / name)
+        except UnicodeEncodeError:
+            return f"The name of {folder / name!a} is not UTF-8: rename the file."
+        except ImageError as error:
+            return str(error)
+        return Photograph(name, header.width, header.height, header.exif)
+
+    photographs, refused = [], {}
+    with ThreadPoolExecutor(job.threads) as pool:
+        for name, result in zip(names, pool.map(read, names), strict=True):
+            progress.step()
+            if isinstance(result, str):
+                refused[name.encode("utf-8", "backslashreplace").decode()] = result
+            else:
+                photographs.append(result)
+    return photographs, refused
+
+
+def _check_scene(folder: Path, names: list[str], contents: set[str], refused: dict[str, str]) -> None:
+    if len(contents) >= 2:
+        return
+    _warn(refused.values())
+    if not names:
+        raise SceneError(
+            f"The folder '{folder}' holds no JPEG, PNG, TIFF, WebP or BMP image: add some or name another."
+        )
+    usable = "only one usable image (or copies of it)" if contents else "no usable image"
+    first = f"; {len(refused)} refused, first: {next(iter(refused.values()))}" if refused else "."
+    raise SceneError(f"At least two images are needed, but '{folder}' holds {usable}: add images{first}")
+
+
+def _to_index(
+    photographs: list[Photograph],
+    digests: list[str],
+    found: ImageCameras,
+    refused: dict[str, str],
+    job: StageJob,
+) -> ImageIndex:
+    first_with: dict[str, int] = {}
+    originals = [first_with.setdefault(digest, row) for row, digest in enumerate(digests)]
+    models, camera_sizes, params, sources = cameras_to_columns(found.cameras)
+    return ImageIndex(
+        names=np.array([p.name for p in photographs], dtype=object),
+        sizes=np.array([(p.width, p.height) for p in photographs], np.int32),
+        sha256=np.array(digests, dtype=object),
+        blocks=np.array([block_of(p.name, job.settings["blocks"]) for p in photographs], np.int32),
+        camera_ids=found.camera_ids,
+        orientations=np.array([p.exif.orientation for p in photographs], np.int32),
+        focal_exif_px=found.focal_exif_px,
+        gps=np.array([p.exif.gps for p in photographs], np.float64),
+        duplicate_of=np.array(
+            [-1 if original == row else original for row, original in enumerate(originals)], np.int32
+        ),
+        camera_models=np.array(models, dtype=object),
+        camera_sizes=camera_sizes,
+        camera_params=params,
+        camera_sources=np.array(sources, dtype=object),
+        refused_names=np.array(list(refused), dtype=object),
+        refused_reasons=np.array(list(refused.values()), dtype=object),
+    )
+
+
+def _report(index: ImageIndex) -> None:
+    copies = [row for row, original in enumerate(index.duplicate_of) if original >= 0]
+    _warn(index.refused_reasons)
+    _warn(f"{index.names[row]} is a copy of {index.names[index.duplicate_of[row]]}." for row in copies)
+    sources = ", ".join(
+        f"{count} {source}" for source, count in sorted(Counter(index.camera_sources).items())
+    )
+    print(
+        f"{len(index.names)} images, {len(index.camera_models)} cameras ({sources}), "
+        f"{len(index.refused_names)} refused",
+        flush=True,
+    )
+
+
+def _warn(sentences: Iterable[str]) -> None:
+    for sentence in sentences:
+        print(f"warning: {sentence}", flush=True)

@@ -1,0 +1,223 @@
+"""render_report: one HTML page about a scene, from the artifacts of its stages."""
+
+import json
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import snakesfm
+from snakesfm.artifacts import (
+    CameraRotations,
+    ImageIndex,
+    Reconstruction,
+    TrackTable,
+    TriangulatedPoints,
+    TwoViewGeometries,
+    ViewGraph,
+    atomic_path,
+    read_header,
+)
+from snakesfm.artifacts.base import Array
+from snakesfm.artifacts.pairs import EDGE_LABELS, KINDS, REJECTIONS
+from snakesfm.geometry.camera import cameras_from_columns
+from snakesfm.reporting.page import Page, render_page
+from snakesfm.reporting.plots import error_histogram, scene_map, view_axes
+from snakesfm.reporting.registration import (
+    ImageCounts,
+    count_by_image,
+    mean_by_image,
+    observation_errors,
+    reason_not_registered,
+)
+from snakesfm.reporting.tables import bundle_rows, image_rows, label_counts, metric_tables, stage_times
+from snakesfm.stages.job import StageJob
+
+
+@dataclass(frozen=True)
+class Pairs:
+    """What the report needs of the two-view geometries of all tiles."""
+
+    pairs: Array
+    rejections: Array
+    kinds: Array
+    match_counts: Array
+    inlier_counts: Array
+
+
+def run(job: StageJob) -> None:
+    """Write index.html."""
+    index = ImageIndex.read(job.path("index"))
+    model = Reconstruction.read(job.path("reconstruction"))
+    graph = ViewGraph.read(job.path("graph"))
+    rotations = CameraRotations.read(job.path("rotations"))
+    pairs = _read_pairs(job.paths("geometries"))
+    tracks = _read_columns(TrackTable, job.path("tracks"), ("offsets", "image_ids"))
+    points = _read_columns(TriangulatedPoints, job.path("points"), ("offsets", "image_ids"))
+    metrics = json.loads(job.path("metrics").read_text("utf-8"))
+    summary = json.loads(job.path("summary").read_text("utf-8")) if "summary" in job.inputs else {}
+    benchmarks = job.paths("benchmarks") if "benchmarks" in job.inputs else []
+
+    count = len(index.names)
+    names = [str(name) for name in index.names]
+    point_of = np.repeat(np.arange(len(model.points)), np.diff(model.offsets))
+    cameras = cameras_from_columns(model.camera_models, model.camera_sizes, model.camera_params)
+    errors = observation_errors(
+        cameras,
+        index.camera_ids,
+        model.rotations,
+        model.translations,
+        model.points[point_of],
+        model.image_ids,
+        model.keypoints,
+    )
+    counts = ImageCounts(
+        pairs=count_by_image(pairs.pairs, count),
+        accepted=count_by_image(pairs.pairs[pairs.rejections == 0], count),
+        kept=count_by_image(graph.pairs[graph.labels == 0], count),
+        components=graph.components,
+        rotated=np.asarray(np.isfinite(rotations.rotations).all(axis=(1, 2))),
+        track_observations=count_by_image(tracks["image_ids"], count),
+        point_observations=count_by_image(points["image_ids"], count),
+        registered=np.asarray(np.isfinite(model.rotations).all(axis=(1, 2))),
+        observations=count_by_image(model.image_ids, count),
+        mean_error_px=mean_by_image(errors, model.image_ids, count),
+    )
+    seconds = stage_times({path: path.read_text("utf-8") for path in benchmarks})
+    rows, note = image_rows(names, counts, metrics.get("per_image", {}), job.options.max_images)
+    heads = ["image", "registered", "pairs", "accepted", "kept edges", "observations", "mean error px"]
+    if metrics.get("per_image"):
+        heads += ["rotation error deg", "position error"]
+    registered = np.flatnonzero(counts.registered)
+    page = Page(
+        scene=job.scene,
+        lead=_lead(metrics),
+        software=f"snakesfm {snakesfm.__version__}",
+        warnings=summary.get("warnings", []),
+        maps=_maps(names, model, registered),
+        stage_heads=["stage", "result", *(["seconds", "peak MB"] if seconds else [])],
+        stages=_stage_rows(index, pairs, graph, rotations, tracks, points, model, counts, seconds),
+        tables=[
+            ("Pairs", ["outcome", "pairs"], label_counts(pairs.rejections, ("accepted", *REJECTIONS[1:]))),
+            ("View graph", ["filter", "edges"], label_counts(graph.labels, EDGE_LABELS)),
+            (
+                "Bundle adjustment",
+                ["round", "images", "points", "observations", "cost before", "cost after", "mean error px"],
+                bundle_rows(
+                    model.round_names, model.round_counts, model.round_costs, model.round_errors_px
+                ),
+            ),
+            *metric_tables(metrics),
+        ],
+        histogram=error_histogram(errors),
+        histogram_caption=f"Errors of {len(errors):,} observations; the last bar holds the largest 1 %.",
+        missing=_missing(index, names, counts, pairs, graph),
+        refused=[[str(a), str(b)] for a, b in zip(index.refused_names, index.refused_reasons, strict=True)],
+        image_heads=heads,
+        images=rows,
+        images_note=note,
+        options=_options(job),
+    )
+    with atomic_path(job.output) as temporary:
+        temporary.write_text(render_page(page), "utf-8")
+
+
+def _read_columns(kind: type[Any], path: Path, columns: Sequence[str]) -> dict[str, Array]:
+    with kind.open(path) as file:
+        return {column: file[column][()] for column in columns}
+
+
+def _read_pairs(paths: Sequence[Path]) -> Pairs:
+    columns = ("pairs", "rejections", "kinds", "match_counts", "inlier_counts")
+    parts = [_read_columns(TwoViewGeometries, path, columns) for path in paths]
+    return Pairs(*(np.concatenate([part[column] for part in parts]) for column in columns))
+
+
+def _lead(metrics: Mapping[str, Any]) -> str:
+    text = (
+        f"{metrics['registered_images']:,} of {metrics['images']:,} images registered, "
+        f"{metrics['points']:,} points"
+    )
+    if metrics.get("reprojection_error_px_mean") is not None:
+        text += f", mean reprojection error {metrics['reprojection_error_px_mean']:.3f} px"
+        text += f", mean track length {metrics['track_length_mean']:.2f}"
+    return text + "."
+
+
+def _maps(names: Sequence[str], model: Reconstruction, registered: Array) -> list[tuple[str, str]]:
+    if len(registered) == 0:
+        return []
+    rotations, translations = model.rotations[registered], model.translations[registered]
+    axes = view_axes(rotations, translations)
+    content = ([names[row] for row in registered], rotations, translations, model.points, model.colors)
+    return [
+        ("From above", scene_map(*content, axes)),
+        ("From the side", scene_map(*content, np.array([axes[0], axes[2], -axes[1]]))),
+    ]
+
+
+def _stage_rows(
+    index: ImageIndex,
+    pairs: Pairs,
+    graph: ViewGraph,
+    rotations: CameraRotations,
+    tracks: Mapping[str, Array],
+    points: Mapping[str, Array],
+    model: Reconstruction,
+    counts: ImageCounts,
+    seconds: Mapping[str, tuple[float, float]],
+) -> list[list[Any]]:
+    accepted = pairs.rejections == 0
+    kinds = Counter(pairs.kinds[accepted].tolist())
+    kind_text = ", ".join(f"{kinds[k]:,} {KINDS[k].replace('_', ' ')}" for k in sorted(kinds))
+    sizes = np.bincount(graph.components[graph.components >= 0])
+    residuals = rotations.residuals_deg[np.isfinite(rotations.residuals_deg)]
+    residual = f", median residual {np.median(residuals):.2f} deg" if len(residuals) else ""
+    duplicates = int(np.sum(index.duplicate_of >= 0))
+    results = {
+        "index_images": f"{len(index.names):,} images of {len(index.camera_models):,} cameras; "
+        f"{len(index.refused_names):,} files refused, {duplicates:,} duplicates",
+        "match_pairs": f"{len(pairs.pairs):,} pairs matched, {int(pairs.match_counts.sum()):,} matches",
+        "estimate_two_view": f"{int(accepted.sum()):,} pairs accepted ({kind_text or 'none'}), "
+        f"{int((~accepted).sum()):,} refused; {int(pairs.inlier_counts[accepted].sum()):,} inlier matches",
+        "filter_view_graph": f"{int(np.sum(graph.labels == 0)):,} of {len(graph.labels):,} edges kept; "
+        f"largest component {int(sizes[0]) if len(sizes) else 0:,} images",
+        "average_rotations": f"{int(counts.rotated.sum()):,} images have a rotation{residual}",
+        "build_tracks": f"{len(tracks['offsets']) - 1:,} tracks, {len(tracks['image_ids']):,} keypoints",
+        "triangulate_tracks": f"{len(points['offsets']) - 1:,} points, "
+        f"{len(points['image_ids']):,} observations",
+        "adjust_bundle": f"{int(counts.registered.sum()):,} images, {len(model.points):,} points, "
+        f"{len(model.image_ids):,} observations",
+    }
+    stages = [stage for stage in seconds if stage not in results]
+    rows = [[stage, text] for stage, text in results.items()] + [[stage, ""] for stage in stages]
+    return [[*row, *seconds.get(row[0], (None, None))] for row in rows] if seconds else rows
+
+
+def _missing(
+    index: ImageIndex, names: Sequence[str], counts: ImageCounts, pairs: Pairs, graph: ViewGraph
+) -> list[list[str]]:
+    rows = []
+    for image in np.flatnonzero(~counts.registered).tolist():
+        refused = pairs.rejections[(pairs.pairs == image).any(axis=1)]
+        labels = graph.labels[(graph.pairs == image).any(axis=1)]
+        first = int(index.duplicate_of[image])
+        reason = reason_not_registered(
+            image,
+            counts,
+            names[first] if first >= 0 else "",
+            dict(label_counts(refused[refused > 0], REJECTIONS)),
+            dict(label_counts(labels[labels > 0], EDGE_LABELS)),
+        )
+        rows.append([names[image], reason])
+    return rows
+
+
+def _options(job: StageJob) -> dict[str, str]:
+    """The options that the artifacts say they were made with, by stage."""
+    paths = [path for name in sorted(job.inputs) for path in job.paths(name)[:1]]
+    headers = [read_header(path) for path in paths if path.suffix == ".h5"]
+    return {str(header["stage"]): str(header["options"]) for header in headers if "stage" in header}

@@ -1,0 +1,74 @@
+"""Choose the pairs of images that are matched."""
+
+from pathlib import Path
+
+import numpy as np
+
+from snakesfm.artifacts.features import GlobalDescriptors
+from snakesfm.artifacts.images import ImageIndex
+from snakesfm.artifacts.pairs import ImagePairs
+from snakesfm.config.select_pairs import SelectPairsOptions
+from snakesfm.errors import ConfigError
+from snakesfm.retrieval.listed import listed_pairs
+from snakesfm.retrieval.pairs import PairTable, exhaustive_pairs, sequential_pairs, similar_pairs
+from snakesfm.stages.job import StageJob
+
+
+def run(job: StageJob) -> None:
+    """Choose pairs by the resolved method and write one ImagePairs per tile, empty ones included."""
+    index = ImageIndex.read(job.path("index"))
+    pairs_file = str(job.settings["pairs_file"])
+    options: SelectPairsOptions = job.options.resolve(len(index.names), pairs_file)
+    table = _choose(job, index, options, pairs_file)
+    blocks = np.sort(index.blocks[table.pairs], axis=1)
+    for output in job.outputs:
+        tile = [int(part) for part in output.stem.split("-")]
+        part = table.take(np.flatnonzero((blocks == tile).all(axis=1)))
+        ImagePairs(
+            pairs=part.pairs,
+            reasons=np.array(part.reason_texts(), dtype=object),
+            similarities=part.similarities,
+        ).write(output, job.header)
+    print(f"{len(table.pairs)} pairs of {len(index.names)} images ({options.method})")
+
+
+def _choose(job: StageJob, index: ImageIndex, options: SelectPairsOptions, pairs_file: str) -> PairTable:
+    names = [str(name) for name in index.names]
+    if options.method == "listed":
+        return _read_list(pairs_file, names, [str(name) for name in index.refused_names])
+    if options.method == "exhaustive":
+        return exhaustive_pairs(len(names))
+    table = PairTable.of(np.zeros((0, 2)), "sequential")
+    if "sequential" in options.method:
+        table = table.union(sequential_pairs(names, options.look_ahead))
+    if options.needs_descriptors:
+        table = table.union(_retrieve(job.paths("descriptors"), options))
+    return table
+
+
+def _read_list(path: str, names: list[str], refused: list[str]) -> PairTable:
+    if not path:
+        raise ConfigError("select_pairs.method is 'listed' but no list is given: say --config pairs=FILE.")
+    try:
+        lines = Path(path).expanduser().read_text("utf-8-sig").split("\n")
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(
+            f"The list of pairs '{path}' cannot be read ({error}): give a UTF-8 text file."
+        ) from None
+    table, skipped = listed_pairs(lines, names, refused, path)
+    if skipped:
+        print(f"warning: {skipped} listed pairs name an image that cannot be used; they are left out")
+    return table
+
+
+def _retrieve(paths: list[Path], options: SelectPairsOptions) -> PairTable:
+    image_ids = []
+    for path in paths:
+        with GlobalDescriptors.open(path) as file:
+            image_ids.append(file["image_ids"][()])
+    return similar_pairs(
+        image_ids,
+        lambda block: GlobalDescriptors.read(paths[block]).descriptors,
+        int(options.top_k),
+        options.min_score,
+    )

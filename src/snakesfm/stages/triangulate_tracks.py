@@ -1,0 +1,64 @@
+"""Stage triangulate_tracks: points from tracks and averaged poses."""
+
+import numpy as np
+
+from snakesfm.artifacts.images import CalibratedCameras, ImageIndex
+from snakesfm.artifacts.mapping import CameraCenters, CameraRotations, TrackTable, TriangulatedPoints
+from snakesfm.config.triangulate_tracks import TriangulateTracksOptions
+from snakesfm.errors import SceneError
+from snakesfm.geometry.camera import cameras_from_columns
+from snakesfm.geometry.poses import translation_of
+from snakesfm.stages.job import StageJob
+from snakesfm.triangulation.interface import TriangulationLimits
+from snakesfm.triangulation.tracks import mean_colors, triangulate_tracks
+
+
+def run(job: StageJob) -> None:
+    """Triangulate every track between images that have a rotation and a centre.
+
+    Raises
+    ------
+    SceneError : no track gives a point.
+    """
+    options: TriangulateTracksOptions = job.options
+    index = ImageIndex.read(job.path("index"))
+    columns = CalibratedCameras.read(job.path("cameras"))
+    cameras = cameras_from_columns(columns.models, columns.sizes, columns.params, columns.sources)
+    rotations = CameraRotations.read(job.path("rotations")).rotations
+    centers = CameraCenters.read(job.path("centers")).centers
+    tracks = TrackTable.read(job.path("tracks"))
+    points, kept = triangulate_tracks(
+        cameras,
+        index.camera_ids,
+        rotations,
+        translation_of(rotations, centers),
+        tracks.offsets,
+        tracks.image_ids,
+        tracks.keypoints,
+        TriangulationLimits(
+            options.max_reprojection_error_px,
+            options.min_angle_deg,
+            options.max_hypotheses,
+            job.seed_for("triangulation"),
+        ),
+        options.method,
+        options.min_length,
+    )
+    count = len(tracks.offsets) - 1
+    good = np.isfinite(points[:, 0])
+    if not good.any():
+        raise SceneError(
+            f"Scene '{job.scene}': none of {count} tracks meets in one point under the averaged poses: "
+            "check the cameras' focal lengths, or raise triangulate_tracks.max_reprojection_error_px."
+        )
+    lengths = np.add.reduceat(kept.astype(np.int64), tracks.offsets[:-1])[good]
+    offsets = np.r_[0, np.cumsum(lengths)].astype(np.int64)
+    print(f"{good.sum()} points of {count} tracks, {kept.sum()} of {len(kept)} observations")
+    TriangulatedPoints(
+        points=points[good],
+        offsets=offsets,
+        image_ids=tracks.image_ids[kept],
+        keypoint_ids=tracks.keypoint_ids[kept],
+        keypoints=tracks.keypoints[kept],
+        colors=mean_colors(tracks.colors[kept], offsets),
+    ).write(job.output, job.header)

@@ -1,0 +1,1 @@
+"""Scenes whose truth is known exactly: for tests, benchmarks and demos."""

@@ -1,0 +1,1 @@
+"""Tracks: keypoints of many images that show one point."""

@@ -1,0 +1,134 @@
+"""Disjoint sets over inlier matches."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from snakesfm.tracks.canonical import canonical_keypoints
+from snakesfm.tracks.split import cycle_support, split_conflicts
+
+Array = NDArray[Any]
+
+
+@dataclass(frozen=True)
+class Tracks:
+    """Tracks, flat: rows ``offsets[k]:offsets[k+1]`` of the other arrays belong to track k.
+
+    Parameters
+    ----------
+    offsets : (T+1,) int64.
+    image_ids : (L,) int32, ascending within a track.
+    keypoint_ids : (L,) int32, row of the keypoint in its image.
+    conflicts : components of matches that saw an image twice.
+    """
+
+    offsets: Array
+    image_ids: Array
+    keypoint_ids: Array
+    conflicts: int
+
+
+def build_tracks(
+    keypoints: list[Array],
+    pairs: Array,
+    offsets: Array,
+    matches: Array,
+    min_length: int = 3,
+    merge_radius_px: float = 1.0,
+    split: bool = True,
+) -> Tracks:
+    """Join matches to tracks that see each image at most once.
+
+    Connected components of the match graph; those that see an image at two places are split at their
+    weakest links (see :func:`snakesfm.tracks.split.split_conflicts`), a link's strength being the number
+    of 3-cycles that confirm it, then the number of matches of its pair.
+
+    Parameters
+    ----------
+    keypoints : per image (K_i,2) float32, pixels.
+    pairs : (P,2) int, images i < j.
+    offsets : (P+1,) int64, rows ``offsets[k]:offsets[k+1]`` of ``matches`` belong to pair k.
+    matches : (M,2) int, keypoint rows in image i and in image j.
+    min_length : images that a track must be seen in.
+    merge_radius_px : keypoints of one image within this distance are one observation.
+    split : split conflicting components; otherwise they are dropped.
+
+    Returns
+    -------
+    Tracks sorted by their first observation.
+    """
+    base = np.r_[0, np.cumsum([len(k) for k in keypoints])].astype(np.int64)
+    canonical = np.concatenate(
+        [canonical_keypoints(k) + start for k, start in zip(keypoints, base[:-1], strict=True)]
+        or [np.zeros(0, dtype=np.int64)]
+    )
+    counts = np.diff(offsets)
+    pair_of = np.repeat(np.arange(len(pairs)), counts)
+    links = np.stack([canonical[base[pairs[pair_of, side]] + matches[:, side]] for side in (0, 1)], axis=1)
+    _, kept = np.unique(links[:, 0] * np.int64(base[-1]) + links[:, 1], return_index=True)
+    links, weights = links[kept], counts[pair_of[kept]]
+
+    nodes, flat = np.unique(links, return_inverse=True)
+    links = flat.reshape(-1, 2).astype(np.int64)
+    images = (np.searchsorted(base, nodes, side="right") - 1).astype(np.int64)
+    labels = _components(links, len(nodes))
+    in_conflict = _conflicting(labels, images)
+    conflicts = len(np.unique(labels[in_conflict]))
+    if not split:
+        labels[in_conflict] = -1
+    elif conflicts:
+        positions = np.concatenate(keypoints)[nodes]
+        inside = in_conflict[links[:, 0]]
+        rows, sub = np.unique(links[inside], return_inverse=True)
+        sub = sub.reshape(-1, 2).astype(np.int64)
+        strengths = np.stack([cycle_support(sub, len(rows)), weights[inside]], axis=1)
+        parts = split_conflicts(sub, strengths, images[rows], positions[rows], merge_radius_px)
+        labels[rows] = labels.max() + 1 + parts
+    observed = _one_per_image(labels, images, np.bincount(links.ravel(), minlength=len(nodes)))
+    return _assemble(labels, images, nodes - base[images], observed, min_length, conflicts)
+
+
+def _components(links: Array, count: int) -> Array:
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    ones = np.ones(len(links), dtype=np.int8)
+    graph = coo_matrix((ones, (links[:, 0], links[:, 1])), shape=(count, count))
+    return np.asarray(connected_components(graph, directed=False)[1], dtype=np.int64)
+
+
+def _conflicting(labels: Array, images: Array) -> Array:
+    """Nodes (K,) bool of components that hold two keypoints of one image."""
+    order = np.lexsort((images, labels))
+    same = (np.diff(labels[order]) == 0) & (np.diff(images[order]) == 0)
+    bad = np.zeros(int(labels.max(initial=-1)) + 1, dtype=bool)
+    bad[labels[order][1:][same]] = True
+    return np.asarray(bad[labels])
+
+
+def _one_per_image(labels: Array, images: Array, degrees: Array) -> Array:
+    """Nodes (K,) bool that stand for their place: the best linked of each track and image."""
+    order = np.lexsort((np.arange(len(labels)), -degrees, images, labels))
+    fresh = np.r_[True, (np.diff(labels[order]) != 0) | (np.diff(images[order]) != 0)][: len(labels)]
+    observed = np.zeros(len(labels), dtype=bool)
+    observed[order[fresh]] = True
+    return observed & (labels >= 0)
+
+
+def _assemble(
+    labels: Array, images: Array, rows: Array, observed: Array, min_length: int, conflicts: int
+) -> Tracks:
+    labels, images, rows = labels[observed], images[observed], rows[observed]
+    _, first, inverse, lengths = np.unique(
+        labels, return_index=True, return_inverse=True, return_counts=True
+    )
+    # nodes ascend by image and keypoint, so a track's first node is its first observation
+    rank = first[inverse]
+    keep = lengths[inverse] >= min_length
+    order = np.nonzero(keep)[0]
+    order = order[np.argsort(rank[order], kind="stable")]
+    starts = np.r_[True, np.diff(rank[order]) != 0][: len(order)]
+    offsets = np.r_[np.nonzero(starts)[0], len(order)].astype(np.int64)
+    return Tracks(offsets, images[order].astype(np.int32), rows[order].astype(np.int32), conflicts)

@@ -1,0 +1,1 @@
+"""Camera centres from rotations, directions between cameras and rays to landmarks."""

@@ -1,0 +1,206 @@
+"""Bundle adjustment of centres and landmarks with known rotations, on the angles of the rays."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from snakesfm.translation_averaging.landmarks import intersect, perpendicular, sum_by
+from snakesfm.translation_averaging.problem import PositioningProblem
+
+Array = NDArray[Any]
+
+
+@dataclass(frozen=True)
+class _Linearized:
+    """Residual directions of all rays and edges at one state, and what depends on them alone."""
+
+    ray_units: Array
+    ray_lengths: Array
+    ray_misses: Array
+    edge_units: Array
+    edge_lengths: Array
+    edge_misses: Array
+
+
+def refine_angles(
+    problem: PositioningProblem,
+    centers: Array,
+    scale_rad: float,
+    rounds: int = 20,
+    edge_weight: float = 0.1,
+) -> tuple[Array, Array]:
+    """Centres (N,3) and landmarks (max track + 1, 3) that fit the rays and edges best, from a first guess.
+
+    Levenberg-Marquardt with the landmarks eliminated (Schur complement); the residual of a ray is the chord
+    between it and the direction to its landmark, under a Cauchy loss whose scale shrinks to ``scale_rad``.
+    Images without a first guess stay NaN and their rays and edges are not used. The gauge is left to the
+    damping: the result is in the frame and near the scale of the first guess.
+    """
+    known = np.isfinite(centers[:, 0])
+    problem = problem.select_edges(known[problem.pairs[:, 0]] & known[problem.pairs[:, 1]]).select_rays(
+        known[problem.ray_images]
+    )
+    track_count = int(problem.ray_tracks.max(initial=-1)) + 1
+    points = intersect(centers[problem.ray_images], problem.rays, problem.ray_tracks, track_count)
+    problem = problem.select_rays(np.isfinite(points[problem.ray_tracks, 0]))
+    images = problem.images()
+    column = np.full(problem.image_count, -1)
+    column[images] = np.arange(len(images))
+    tracks, track_row = np.unique(problem.ray_tracks, return_inverse=True)
+    ends = column[problem.pairs]
+    ray_column = column[problem.ray_images]
+    structure = _structure(ray_column, track_row, ends)
+
+    place, spots = centers[images].copy(), points[tracks].copy()
+    sigmas = np.maximum(problem.sigmas_rad, scale_rad)
+    damping = 1e-4
+    state = _linearize(problem, ends, ray_column, track_row, place, spots)
+    stage = 8.0
+    for _ in range(rounds):
+        ray_scale = scale_rad * stage
+        edge_scale = sigmas * stage
+        cost = _cost(state, ray_scale, edge_scale, edge_weight)
+        ray_w = 1.0 / (ray_scale**2 + state.ray_misses**2)
+        edge_w = edge_weight / (edge_scale**2 + state.edge_misses**2)
+        improved = False
+        for _ in range(6):
+            step, move = _step(
+                problem, state, ends, ray_column, track_row, structure, ray_w, edge_w, damping
+            )
+            trial = _linearize(problem, ends, ray_column, track_row, place + step, spots + move)
+            trial_cost = _cost(trial, ray_scale, edge_scale, edge_weight)
+            if trial_cost < cost:
+                improved = True
+                break
+            damping *= 8.0
+        if improved:
+            place, spots, state = place + step, spots + move, trial
+            damping = max(damping / 5.0, 1e-9)
+        if stage > 1.0:
+            stage = max(stage / 2.0, 1.0)
+        elif not improved or cost - trial_cost < 1e-4 * cost:
+            break
+    result = np.full_like(centers, np.nan)
+    result[images] = place
+    landmarks = np.full((track_count, 3), np.nan)
+    landmarks[tracks] = spots
+    return result, landmarks
+
+
+def _linearize(
+    problem: PositioningProblem,
+    ends: Array,
+    ray_column: Array,
+    track_row: Array,
+    place: Array,
+    spots: Array,
+) -> _Linearized:
+    offsets = spots[track_row] - place[ray_column]
+    ray_lengths = np.maximum(np.linalg.norm(offsets, axis=1), 1e-9)
+    ray_units = offsets / ray_lengths[:, None]
+    baselines = place[ends[:, 1]] - place[ends[:, 0]]
+    edge_lengths = np.maximum(np.linalg.norm(baselines, axis=1), 1e-9)
+    edge_units = baselines / edge_lengths[:, None]
+    return _Linearized(
+        ray_units,
+        ray_lengths,
+        np.linalg.norm(ray_units - problem.rays, axis=1),
+        edge_units,
+        edge_lengths,
+        np.linalg.norm(edge_units - problem.directions, axis=1),
+    )
+
+
+def _cost(state: _Linearized, ray_scale: float, edge_scale: Array, edge_weight: float) -> float:
+    rays = np.log1p((state.ray_misses / ray_scale) ** 2).sum()
+    edges = np.log1p((state.edge_misses / edge_scale) ** 2).sum()
+    return float(rays + edge_weight * edges)
+
+
+@dataclass(frozen=True)
+class _Structure:
+    """Which 3x3 blocks the reduced camera system has; the same in every step."""
+
+    first: Array
+    second: Array
+    groups: Array
+    rows: Array
+    columns: Array
+
+
+def _structure(ray_column: Array, track_row: Array, ends: Array) -> _Structure:
+    """Rays of one landmark in pairs ``first <= second``, and the upper blocks that pairs and edges add to."""
+    lengths = np.bincount(track_row)
+    stops = np.cumsum(lengths)[track_row]
+    per_ray = stops - np.arange(len(track_row))
+    first = np.repeat(np.arange(len(track_row)), per_ray)
+    second = first + np.arange(len(first)) - np.repeat(np.cumsum(per_ray) - per_ray, per_ray)
+    cameras = int(max(ends.max(initial=-1), ray_column.max(initial=-1))) + 1
+    # Within a landmark the rays are sorted by camera, so these blocks lie on or above the diagonal.
+    row = np.concatenate([ray_column[first], ends.min(axis=1), np.arange(cameras)])
+    column = np.concatenate([ray_column[second], ends.max(axis=1), np.arange(cameras)])
+    keys, groups = np.unique(row * cameras + column, return_inverse=True)
+    return _Structure(first, second, groups, keys // cameras, keys % cameras)
+
+
+def _step(
+    problem: PositioningProblem,
+    state: _Linearized,
+    ends: Array,
+    ray_column: Array,
+    track_row: Array,
+    structure: _Structure,
+    ray_w: Array,
+    edge_w: Array,
+    damping: float,
+) -> tuple[Array, Array]:
+    """Damped Gauss-Newton steps of the cameras (n,3) and of the landmarks (m,3)."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.linalg import splu
+
+    cameras, landmarks = int(ends.max(initial=-1)) + 1, int(track_row.max(initial=-1)) + 1
+    cameras = max(cameras, int(ray_column.max(initial=-1)) + 1)
+    ray_h = perpendicular(state.ray_units) * (ray_w / state.ray_lengths**2)[:, None, None]
+    along = np.einsum("qi,qi->q", state.ray_units, problem.rays)
+    ray_g = (problem.rays - state.ray_units * along[:, None]) * (ray_w / state.ray_lengths)[:, None]
+    edge_h = perpendicular(state.edge_units) * (edge_w / state.edge_lengths**2)[:, None, None]
+    along = np.einsum("ei,ei->e", state.edge_units, problem.directions)
+    edge_g = (problem.directions - state.edge_units * along[:, None]) * (edge_w / state.edge_lengths)[
+        :, None
+    ]
+
+    camera_h = (
+        sum_by(ray_h, ray_column, cameras)
+        + sum_by(edge_h, ends[:, 0], cameras)
+        + sum_by(edge_h, ends[:, 1], cameras)
+    )
+    camera_g = (
+        -sum_by(ray_g, ray_column, cameras)
+        - sum_by(edge_g, ends[:, 0], cameras)
+        + sum_by(edge_g, ends[:, 1], cameras)
+    )
+    camera_h += np.eye(3) * (damping * np.trace(camera_h, axis1=1, axis2=2) + 1e-12)[:, None, None]
+    point_h = sum_by(ray_h, track_row, landmarks)
+    point_h += np.eye(3) * (damping * np.trace(point_h, axis1=1, axis2=2) + 1e-12)[:, None, None]
+    point_g = sum_by(ray_g, track_row, landmarks)
+    inverse = np.linalg.inv(point_h)
+
+    gain = ray_h @ inverse[track_row]
+    reduced_g = camera_g + sum_by(np.einsum("qij,qj->qi", gain, point_g[track_row]), ray_column, cameras)
+    fill = -(gain[structure.first] @ ray_h[structure.second])
+    blocks = sum_by(np.concatenate([fill, -edge_h, camera_h]), structure.groups, len(structure.rows))
+    off = structure.rows != structure.columns
+    blocks = np.concatenate([blocks, blocks[off].transpose(0, 2, 1)])
+    row = np.concatenate([structure.rows, structure.columns[off]])
+    column = np.concatenate([structure.columns, structure.rows[off]])
+    shape = (len(blocks), 3, 3)
+    rows = np.broadcast_to(3 * row[:, None, None] + np.arange(3)[:, None], shape)
+    columns = np.broadcast_to(3 * column[:, None, None] + np.arange(3), shape)
+    matrix = coo_matrix((blocks.ravel(), (rows.ravel(), columns.ravel())), shape=(3 * cameras,) * 2).tocsc()
+    step = splu(matrix, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True}, diag_pivot_thresh=0.0)
+    delta = step.solve(reduced_g.ravel()).reshape(-1, 3)
+    pull = sum_by(np.einsum("qij,qj->qi", ray_h, delta[ray_column]), track_row, landmarks)
+    move = np.einsum("pij,pj->pi", inverse, point_g + pull)
+    return delta, move

@@ -1,0 +1,127 @@
+"""From directions to checked centres: first guess, refinement, weak cameras, gauge, residuals."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from snakesfm.translation_averaging.angular import refine_angles
+from snakesfm.translation_averaging.averagers import TranslationAverager, edge_angles_rad, with_rays
+from snakesfm.translation_averaging.landmarks import angles_rad, intersect
+from snakesfm.translation_averaging.problem import PositioningProblem
+from snakesfm.translation_averaging.support import SupportLimits, attach_cameras, held_cameras
+
+Array = NDArray[Any]
+
+
+@dataclass(frozen=True)
+class AveragedCenters:
+    """Centres of N cameras, and how well E edges and Q rays agree with them."""
+
+    centers: Array
+    """(N,3), NaN where there is none; the median edge is one unit long and the median centre the origin."""
+    edge_residuals_rad: Array
+    """(E) NaN where a centre is missing."""
+    ray_tracks: Array
+    """(Q) track of each ray that took part."""
+    ray_residuals_rad: Array
+    """(Q)."""
+
+
+def average_translations(
+    problem: PositioningProblem,
+    averager: TranslationAverager,
+    limits: SupportLimits,
+    *,
+    refine: bool = True,
+    rays_per_camera: int = 100,
+    edge_weight: float = 0.1,
+    seed: int = 0,
+) -> AveragedCenters:
+    """Position the cameras of the largest connected part.
+
+    A camera that its rays and edges do not hold in place is positioned again from the others, and gets no
+    centre if that does not hold either: weakly seen cameras are otherwise thrown far away.
+    """
+    part = largest_part(problem)
+    chosen = with_rays(part, rays_per_camera)
+    images = part.images()
+    if len(images) < 2:
+        centers = np.full((problem.image_count, 3), np.nan)
+    elif len(images) == 2 and len(part.pairs):
+        centers = np.full((problem.image_count, 3), np.nan)
+        centers[part.pairs[0, 0]] = 0.0
+        centers[part.pairs[0, 1]] = part.directions[0]
+    else:
+        centers = averager.position(part, seed)
+        if refine:
+            centers = _refined(chosen, centers, limits, edge_weight)
+        checked = _checked(chosen, centers, limits)
+        # Cameras that moved or went away may have bent their neighbourhood.
+        if refine and not np.array_equal(checked, centers, equal_nan=True):
+            checked = _refined(chosen, checked, limits, edge_weight)
+            checked = _checked(chosen, checked, limits, attach=False)
+        centers = checked
+    centers = normalize_gauge(part, centers)
+    seen = chosen.select_rays(np.isfinite(centers[chosen.ray_images, 0]))
+    points = _landmarks(seen, centers)
+    return AveragedCenters(
+        centers=centers,
+        edge_residuals_rad=edge_angles_rad(problem, centers),
+        ray_tracks=seen.ray_tracks,
+        ray_residuals_rad=angles_rad(seen, centers, points),
+    )
+
+
+def largest_part(problem: PositioningProblem) -> PositioningProblem:
+    """The edges and rays of the largest set of images that edges or tracks connect."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    tracks, track_node = np.unique(problem.ray_tracks, return_inverse=True)
+    count = problem.image_count + len(tracks)
+    rows = np.concatenate([problem.pairs[:, 0], problem.ray_images])
+    cols = np.concatenate([problem.pairs[:, 1], problem.image_count + track_node])
+    graph = coo_matrix((np.ones(len(rows)), (rows, cols)), shape=(count, count))
+    labels = connected_components(graph, directed=False)[1][: problem.image_count]
+    main = labels == np.argmax(np.bincount(labels)) if problem.image_count else np.zeros(0, dtype=bool)
+    return problem.select_edges(main[problem.pairs[:, 0]]).select_rays(main[problem.ray_images])
+
+
+def normalize_gauge(problem: PositioningProblem, centers: Array) -> Array:
+    """Centres moved and scaled: the median edge has length one, the median of the centres is the origin."""
+    known = np.isfinite(centers[:, 0])
+    if not known.any():
+        return centers
+    lengths = np.linalg.norm(centers[problem.pairs[:, 1]] - centers[problem.pairs[:, 0]], axis=1)
+    lengths = lengths[np.isfinite(lengths) & (lengths > 0)]
+    scale = float(np.median(lengths)) if len(lengths) else 1.0
+    return np.asarray((centers - np.median(centers[known], axis=0)) / scale)
+
+
+def _landmarks(problem: PositioningProblem, centers: Array) -> Array:
+    size = int(problem.ray_tracks.max(initial=-1)) + 1
+    return intersect(centers[problem.ray_images], problem.rays, problem.ray_tracks, size)
+
+
+def _refined(
+    problem: PositioningProblem, centers: Array, limits: SupportLimits, edge_weight: float
+) -> Array:
+    return refine_angles(
+        problem, normalize_gauge(problem, centers), limits.sigma_rad, edge_weight=edge_weight
+    )[0]
+
+
+def _checked(
+    problem: PositioningProblem, centers: Array, limits: SupportLimits, attach: bool = True
+) -> Array:
+    known = np.isfinite(centers[:, 0])
+    points = _landmarks(problem.select_rays(known[problem.ray_images]), centers)
+    # Rays of images without centre may point to higher tracks than the triangulated ones.
+    size = int(problem.ray_tracks.max(initial=-1)) + 1
+    points = np.concatenate([points, np.full((size - len(points), 3), np.nan)])
+    held = known & held_cameras(problem, centers, points, limits)
+    if attach:
+        return attach_cameras(problem, centers, held, limits)
+    return np.where(held[:, None], centers, np.nan)

@@ -1,0 +1,109 @@
+"""The interchangeable methods: every one turns a problem into camera centres up to a similarity."""
+
+import math
+from dataclasses import dataclass
+from typing import Any, Literal, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from snakesfm.translation_averaging.landmarks import cover_cameras
+from snakesfm.translation_averaging.problem import PositioningProblem
+
+Array = NDArray[Any]
+
+
+class TranslationAverager(Protocol):
+    """Positions cameras of known rotation."""
+
+    def position(self, problem: PositioningProblem, seed: int) -> Array:
+        """Centres (N,3) in the frame of the rotations, up to scale and shift; NaN where there is none.
+
+        The problem is connected, and has at least three images.
+        """
+
+
+@dataclass(frozen=True)
+class ScaleChain:
+    """Baselines compared through shared landmarks, then linear; see :mod:`scale_chain`.
+
+    Draws nothing at random. Where too few landmarks are shared to link most cameras,
+    :class:`TranslationRecovery` is used instead.
+    """
+
+    rays_per_camera: int = 100
+    sigma_rad: float = math.radians(0.3)
+
+    def position(self, problem: PositioningProblem, seed: int) -> Array:
+        """See :class:`TranslationAverager`."""
+        from snakesfm.translation_averaging.scale_chain import chain_centers
+
+        centers = chain_centers(with_rays(problem, self.rays_per_camera), 1.5 * self.sigma_rad)
+        if 2 * np.isfinite(centers[:, 0]).sum() < len(problem.images()):
+            return TranslationRecovery().position(problem, seed)
+        return centers
+
+
+@dataclass(frozen=True)
+class TranslationRecovery:
+    """gtsam's TranslationRecovery on camera-camera and camera-landmark directions with a Huber loss.
+
+    With the outlier rejection of 1DSfM (Wilson and Snavely, ECCV 2014; ``mfas``), or by the residuals of a
+    first solution (``residual``). It starts at random places.
+    """
+
+    rays_per_camera: int = 12
+    sigma: float = 0.01
+    huber: float = 1.345
+    reject_outliers: Literal["mfas", "residual", "none"] = "residual"
+    residual_rad: float = math.radians(5.0)
+    mfas_projections: int = 100
+    mfas_weight: float = 0.125
+
+    def position(self, problem: PositioningProblem, seed: int) -> Array:
+        """See :class:`TranslationAverager`."""
+        from snakesfm.translation_averaging.recovery import mfas_weights, recover_translations
+
+        problem = with_rays(problem, self.rays_per_camera)
+        if self.reject_outliers == "mfas" and len(problem.pairs):
+            keep = mfas_weights(problem, self.mfas_projections, seed) < self.mfas_weight
+            problem = problem.select_edges(keep)
+        centers = recover_translations(problem, self.sigma, self.huber, seed)
+        if self.reject_outliers == "residual":
+            keep = ~(edge_angles_rad(problem, centers) > self.residual_rad)
+            if not keep.all():
+                centers = recover_translations(problem.select_edges(keep), self.sigma, self.huber, seed)
+        return centers
+
+
+@dataclass(frozen=True)
+class GlobalPositioning:
+    """pycolmap's global positioning (Pan et al., "Global Structure-from-Motion Revisited", ECCV 2024).
+
+    ``start`` is ``random``, as in GLOMAP, or ``chain``: the centres of :class:`ScaleChain`.
+    """
+
+    rays_per_camera: int = 100
+    loss_scale: float = 0.01
+    start: Literal["random", "chain"] = "random"
+
+    def position(self, problem: PositioningProblem, seed: int) -> Array:
+        """See :class:`TranslationAverager`."""
+        from snakesfm.translation_averaging.positioning import position_globally
+
+        start = ScaleChain().position(problem, seed) if self.start == "chain" else None
+        return position_globally(with_rays(problem, self.rays_per_camera), start, self.loss_scale, seed)
+
+
+def with_rays(problem: PositioningProblem, rays_per_camera: int) -> PositioningProblem:
+    """The problem with the tracks that give each camera about ``rays_per_camera`` rays."""
+    return problem.select_rays(
+        cover_cameras(problem.ray_images, problem.ray_tracks, problem.image_count, rays_per_camera)
+    )
+
+
+def edge_angles_rad(problem: PositioningProblem, centers: Array) -> Array:
+    """Angles (E) between the edges' directions and those between the centres; NaN where one is missing."""
+    baselines = centers[problem.pairs[:, 1]] - centers[problem.pairs[:, 0]]
+    cross = np.linalg.norm(np.cross(baselines, problem.directions), axis=1)
+    return np.asarray(np.arctan2(cross, np.einsum("ei,ei->e", baselines, problem.directions)))

@@ -1,0 +1,89 @@
+"""pycolmap's global positioning."""
+
+from typing import Any
+
+import cv2  # noqa: F401 - must be loaded before pycolmap, whose PNG library clashes otherwise
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from snakesfm.translation_averaging.landmarks import intersect, sum_by
+from snakesfm.translation_averaging.problem import PositioningProblem
+
+Array = NDArray[Any]
+FOCAL_PX = 1000.0
+
+
+def position_globally(
+    problem: PositioningProblem, start: Array | None, loss_scale: float, seed: int
+) -> Array:
+    """Centres (N,3) from rays alone; NaN for images without rays.
+
+    The rays are handed over as pixels of virtual cameras that look along the mean ray of their image.
+    Ceres adds up in several threads, so results of two runs differ in the last bits (1e-11).
+    Without ``start`` (N,3) cameras and landmarks begin at random places.
+    """
+    pycolmap.logging.minloglevel = 2
+    images, rows = np.unique(problem.ray_images, return_inverse=True)
+    rotations = _facing(problem.rays, rows, len(images))
+    local = np.einsum("qij,qj->qi", rotations[rows], problem.rays)
+    usable = local[:, 2] > 0.01
+    problem, local = problem.select_rays(usable), local[usable]
+    tracks, starts, lengths = np.unique(problem.ray_tracks, return_index=True, return_counts=True)
+    points = np.zeros((int(tracks.max(initial=-1)) + 1, 3))
+    if start is not None:
+        known = np.isfinite(start[problem.ray_images, 0])
+        seen = problem.select_rays(known)
+        points = np.nan_to_num(intersect(start[seen.ray_images], seen.rays, seen.ray_tracks, len(points)))
+
+    model = pycolmap.Reconstruction()
+    camera = pycolmap.Camera(
+        camera_id=1, model="PINHOLE", width=1, height=1, params=[FOCAL_PX, FOCAL_PX, 0.0, 0.0]
+    )
+    model.add_camera_with_trivial_rig(camera)
+    order = np.argsort(problem.ray_images, kind="stable")
+    bounds = np.searchsorted(problem.ray_images[order], images, side="left")
+    ends = np.searchsorted(problem.ray_images[order], images, side="right")
+    keypoint = np.empty(len(order), dtype=np.int64)
+    pixels = local[:, :2] / local[:, 2:] * FOCAL_PX
+    for row, image in enumerate(images.tolist()):
+        mine = order[bounds[row] : ends[row]]
+        keypoint[mine] = np.arange(len(mine))
+        model.add_image_with_trivial_frame(
+            pycolmap.Image(name=str(image), camera_id=1, image_id=image + 1, keypoints=pixels[mine])
+        )
+        place = np.zeros(3) if start is None else np.nan_to_num(start[image])
+        pose = pycolmap.Rigid3d(pycolmap.Rotation3d(rotations[row]), -rotations[row] @ place)
+        frame = model.image(image + 1).frame
+        frame.set_cam_from_world(1, pose)
+        model.register_frame(frame.frame_id)
+    for track, first, length in zip(tracks.tolist(), starts.tolist(), lengths.tolist(), strict=True):
+        elements = [
+            pycolmap.TrackElement(int(problem.ray_images[q]) + 1, int(keypoint[q]))
+            for q in range(first, first + length)
+        ]
+        model.add_point3D(points[track], pycolmap.Track(elements))
+
+    options = pycolmap.GlobalPositionerOptions()
+    options.use_gpu = False
+    options.random_seed = seed
+    options.loss_function_scale = loss_scale
+    options.min_num_view_per_track = 2
+    if start is not None:
+        options.generate_random_positions = False
+        options.generate_random_points = False
+    centers = np.full((problem.image_count, 3), np.nan)
+    if pycolmap.run_global_positioning(options, pycolmap.PoseGraph(), model):
+        for image in images.tolist():
+            centers[image] = model.image(image + 1).projection_center()
+    return centers
+
+
+def _facing(rays: Array, rows: Array, count: int) -> Array:
+    """Rotations (count,3,3) whose z axis is the mean ray of each image."""
+    forward = sum_by(rays, rows, count)
+    forward /= np.maximum(np.linalg.norm(forward, axis=1, keepdims=True), 1e-12)
+    helper = np.eye(3)[np.argmin(np.abs(forward), axis=1)]
+    right = np.cross(helper, forward)
+    right /= np.linalg.norm(right, axis=1, keepdims=True)
+    return np.stack([right, np.cross(forward, right), forward], axis=1)

@@ -1,0 +1,80 @@
+"""What a translation averager gets and gives."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[Any]
+
+
+@dataclass(frozen=True)
+class PositioningProblem:
+    """Directions in the world frame between N cameras, and from cameras to T landmarks.
+
+    Rows of tracks are sorted by track, then image. Everything is finite: images without rotation have
+    neither edges nor rays.
+    """
+
+    image_count: int
+    """N."""
+    pairs: Array
+    """(E,2) int64, images i and j of each edge."""
+    directions: Array
+    """(E,3) unit vector from camera i to camera j."""
+    sigmas_rad: Array
+    """(E) standard deviation of the direction."""
+    ray_images: Array
+    """(Q) int64, image of each ray."""
+    ray_tracks: Array
+    """(Q) int64, track of each ray, ascending; tracks need not all occur."""
+    rays: Array
+    """(Q,3) unit vector from the camera to the landmark."""
+
+    def select_rays(self, rows: Array) -> "PositioningProblem":
+        """The same problem with some of the rays; ``rows`` is a mask or ascending indices."""
+        return PositioningProblem(
+            self.image_count,
+            self.pairs,
+            self.directions,
+            self.sigmas_rad,
+            self.ray_images[rows],
+            self.ray_tracks[rows],
+            self.rays[rows],
+        )
+
+    def select_edges(self, rows: Array) -> "PositioningProblem":
+        """The same problem with some of the edges."""
+        return PositioningProblem(
+            self.image_count,
+            self.pairs[rows],
+            self.directions[rows],
+            self.sigmas_rad[rows],
+            self.ray_images,
+            self.ray_tracks,
+            self.rays,
+        )
+
+    def images(self) -> Array:
+        """Ascending ids of the images that occur."""
+        return np.unique(np.concatenate([self.pairs.ravel(), self.ray_images]))
+
+
+def edge_directions(rotations: Array, pairs: Array, translations: Array) -> Array:
+    """Unit vectors (E,3) in the world from camera i to camera j.
+
+    Parameters
+    ----------
+    rotations : (N,3,3) cam_from_world.
+    pairs : (E,2).
+    translations : (E,3) j_from_i translations.
+    """
+    return np.asarray(-np.einsum("eji,ej->ei", rotations[pairs[:, 1]], translations))
+
+
+def world_rays(rotations: Array, image_ids: Array, normalized: Array) -> Array:
+    """Unit vectors (Q,3) in the world of undistorted points (Q,2) on the plane z = 1 of their cameras."""
+    rays = np.concatenate([normalized, np.ones((len(normalized), 1))], axis=1)
+    rays = np.einsum("qji,qj->qi", rotations[image_ids], rays)
+    return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))

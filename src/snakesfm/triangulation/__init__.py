@@ -1,0 +1,1 @@
+"""Points from tracks and poses."""

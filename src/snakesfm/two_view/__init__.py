@@ -1,0 +1,1 @@
+"""Relative pose of two images from keypoint matches: estimation, refinement, covariance, acceptance."""

@@ -1,0 +1,60 @@
+"""From matched keypoints to correspondences: duplicates, rays, and one match per place."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from snakesfm.geometry.camera import Camera
+from snakesfm.two_view.sampson import Correspondences
+
+Array = NDArray[Any]
+
+
+def first_rows_at_place(keypoints: Array) -> Array:
+    """For each keypoint (N,2) the first row (N,) int64 with the same coordinates.
+
+    A detector gives one keypoint per orientation; tracks need one keypoint per place.
+    """
+    points = np.ascontiguousarray(keypoints, dtype=np.float32) + np.float32(0.0)
+    places = points.view(np.int64).ravel()
+    _, first, inverse = np.unique(places, return_index=True, return_inverse=True)
+    return first[inverse]
+
+
+def unify_matches(keypoints_i: Array, keypoints_j: Array, matches: Array) -> Array:
+    """Matches (M,2) between the first rows of each place, each once, in the order of their occurrence."""
+    if len(matches) == 0:
+        return np.zeros((0, 2), dtype=np.int32)
+    places = np.column_stack(
+        [first_rows_at_place(keypoints_i)[matches[:, 0]], first_rows_at_place(keypoints_j)[matches[:, 1]]]
+    )
+    _, first = np.unique(places[:, 0] * len(keypoints_j) + places[:, 1], return_index=True)
+    return places[np.sort(first)].astype(np.int32)
+
+
+def correspond(
+    keypoints_i: Array, keypoints_j: Array, matches: Array, camera_i: Camera, camera_j: Camera
+) -> Correspondences:
+    """Undistorted rays of the matched keypoints."""
+    return Correspondences(
+        _rays(camera_i, keypoints_i[matches[:, 0]]),
+        _rays(camera_j, keypoints_j[matches[:, 1]]),
+        camera_i.focal_px,
+        camera_j.focal_px,
+    )
+
+
+def _rays(camera: Camera, keypoints: Array) -> Array:
+    points = camera.normalize(keypoints)
+    return np.column_stack([points, np.ones(len(points))])
+
+
+def one_to_one(matches: Array, errors: Array, selected: Array) -> Array:
+    """Rows of the selected (M,) bool matches (M,2), each keypoint at most once, smallest error first."""
+    rows = np.nonzero(selected)[0]
+    for side in (0, 1):
+        ordered = rows[np.lexsort((rows, np.abs(errors[rows])))]
+        _, first = np.unique(matches[ordered, side], return_index=True)
+        rows = ordered[first]
+    return np.sort(rows)

@@ -1,0 +1,267 @@
+"""The two-view geometry of one pair of images."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from snakesfm.config.estimate_two_view import EstimateTwoViewOptions
+from snakesfm.geometry.camera import Camera
+from snakesfm.geometry.rotations import angle_between, angle_of
+from snakesfm.two_view.bundle import inverse_depths
+from snakesfm.two_view.correspondences import correspond, one_to_one, unify_matches
+from snakesfm.two_view.covariance import DIRECTION_UNKNOWN_VARIANCE
+from snakesfm.two_view.estimators import ESTIMATORS, RobustPose
+from snakesfm.two_view.kinds import fit_homography, fit_rotation, planar_twins, transfer_errors_px
+from snakesfm.two_view.refinement import SIGMA_FLOOR_PX, RefinedPose, refine_pose
+from snakesfm.two_view.sampson import Correspondences, cauchy_cost, sampson_errors_px
+from snakesfm.two_view.significance import significance_of
+
+Array = NDArray[Any]
+THRESHOLD_SIGMAS = 3.0
+SELECTION_SIGMAS = 4.0
+REACH_FACTOR = 4.0
+TWIN_PLANE_RATIO = 0.4
+TWIN_START_RATIO = 0.5
+TWIN_INLIER_RATIO = 0.85
+TWIN_NOISE_FLOOR_PX = 0.1
+TWIN_ROTATION_RAD = float(np.radians(5.0))
+TWIN_DIRECTION_RAD = float(np.radians(15.0))
+
+
+@dataclass(frozen=True)
+class TwoViewEstimate:
+    """Relative pose of a pair, its certainty, and the matches that agree with it.
+
+    Parameters
+    ----------
+    rotation, translation : (3,3) and unit (3,) float64, j_from_i; NaN where there is none.
+    covariance : (5,5) float64 in rad^2: left rotation increment, then the two tangents of
+        ``tangents.tangent_basis(translation)``; NaN where there is no pose.
+    inliers : (K,2) int32, keypoint rows in image i and j, one to one; where several keypoints lie at one
+        place the first of them stands for all.
+    kind : general, planar or rotation_only.
+    rejection : empty if accepted, else why not: too_few_matches, estimation_failed, too_few_inliers,
+        low_inlier_ratio, not_significant, indeterminate, ambiguous.
+    match_count : matches between distinct places.
+    inlier_ratio : share of inliers among them.
+    triangulation_angle_deg : median angle between the inliers' rays.
+    significance : minus log10 of the number of false alarms, 0 where there is no pose.
+    sigma_px : robust standard deviation of the inliers' Sampson errors, NaN where there is no pose.
+    """
+
+    rotation: Array
+    translation: Array
+    covariance: Array
+    inliers: Array
+    kind: str
+    rejection: str
+    match_count: int
+    inlier_ratio: float
+    triangulation_angle_deg: float
+    significance: float
+    sigma_px: float
+
+
+def estimate_two_view_geometry(
+    keypoints_i: Array,
+    keypoints_j: Array,
+    matches: Array,
+    camera_i: Camera,
+    camera_j: Camera,
+    options: EstimateTwoViewOptions,
+    seed: int,
+) -> TwoViewEstimate:
+    """Estimate, refine and judge the relative pose of two images.
+
+    Parameters
+    ----------
+    keypoints_i, keypoints_j : (N,2) float32 in original pixels, all keypoints of each image.
+    matches : (M,2) int32, keypoint rows in image i and in image j.
+    seed : the only source of randomness.
+    """
+    matches = unify_matches(keypoints_i, keypoints_j, matches)
+    points = correspond(keypoints_i, keypoints_j, matches, camera_i, camera_j)
+    # strong distortion cannot be undone everywhere
+    finite: Array = np.isfinite(np.hstack([points.rays_i, points.rays_j])).all(axis=1)
+    matches, points = matches[finite], points.take(finite)
+    if len(matches) < options.min_inliers:
+        return _without_pose("too_few_matches", len(matches))
+    extent = np.ptp(keypoints_j[matches[:, 1]], axis=0)
+    found = _estimate(points, extent, options, seed)
+    if found is None:
+        return _without_pose("estimation_failed", len(matches))
+    robust, refined, significance = found
+    return _judge(points, matches, robust, refined, significance, options, seed)
+
+
+def _without_pose(rejection: str, match_count: int) -> TwoViewEstimate:
+    return TwoViewEstimate(
+        rotation=np.full((3, 3), np.nan),
+        translation=np.full(3, np.nan),
+        covariance=np.full((5, 5), np.nan),
+        inliers=np.zeros((0, 2), dtype=np.int32),
+        kind="general",
+        rejection=rejection,
+        match_count=match_count,
+        inlier_ratio=0.0,
+        triangulation_angle_deg=0.0,
+        significance=0.0,
+        sigma_px=float("nan"),
+    )
+
+
+def _estimate(
+    points: Correspondences, extent: Array, options: EstimateTwoViewOptions, seed: int
+) -> tuple[RobustPose, RefinedPose, float] | None:
+    """The best of a tight estimation and, where the matches are noisier, of one adapted to their noise."""
+    best = _estimate_within(points, extent, options.max_error_px, options, seed)
+    if not options.adapt_error:
+        return best
+    sigma = options.max_error_px if best is None else best[1].sigma_px
+    adapted = min(THRESHOLD_SIGMAS * sigma, options.max_adapted_error_px)
+    if adapted > 1.5 * options.max_error_px:
+        other = _estimate_within(points, extent, adapted, options, seed)
+        if other is not None and (best is None or other[2] > best[2]):
+            best = other
+    return best
+
+
+def _estimate_within(
+    points: Correspondences, extent: Array, max_error_px: float, options: EstimateTwoViewOptions, seed: int
+) -> tuple[RobustPose, RefinedPose, float] | None:
+    robust = ESTIMATORS[options.estimator](points, max_error_px, options.max_iterations, seed)
+    if robust is None:
+        return None
+    refined = refine_pose(
+        points,
+        robust.rotation,
+        robust.translation,
+        options.refine,
+        REACH_FACTOR * max_error_px,
+        options.loss_scale,
+    )
+    return robust, refined, significance_of(refined.errors_px, float(extent[0]), float(extent[1]))
+
+
+def _judge(
+    points: Correspondences,
+    matches: Array,
+    robust: RobustPose,
+    refined: RefinedPose,
+    significance: float,
+    options: EstimateTwoViewOptions,
+    seed: int,
+) -> TwoViewEstimate:
+    selection_px = max(options.inlier_error_px, SELECTION_SIGMAS * refined.sigma_px)
+    agrees = np.abs(refined.errors_px) < selection_px
+    agrees &= _in_front(points, refined.rotation, refined.translation, refined.sigma_px)
+    rows = one_to_one(matches, refined.errors_px, agrees)
+    inliers = points.take(rows)
+    before = float(robust.inliers.sum()) / len(matches)
+    ratio = before if options.ratio_of == "estimator" else len(rows) / len(matches)
+    angles = angle_between(inliers.rays_i @ refined.rotation.T, inliers.rays_j)
+    angle_deg = float(np.degrees(np.median(angles))) if len(rows) else 0.0
+
+    kind, rotation, covariance = "general", refined.rotation, refined.covariance
+    rejection = ""
+    if len(rows) < options.min_inliers:
+        rejection = "too_few_inliers"
+    elif ratio < options.min_inlier_ratio:
+        rejection = "low_inlier_ratio"
+    elif significance < options.min_significance or len(rows) * ratio < options.min_support:
+        rejection = "not_significant"
+    else:
+        kind, ambiguous = _kind_of(inliers, refined, angle_deg, selection_px, options, seed)
+        if kind == "rotation_only":
+            rotation, of_rotation = fit_rotation(inliers, rotation, 1.0, SIGMA_FLOOR_PX)
+            covariance = np.eye(5) * DIRECTION_UNKNOWN_VARIANCE
+            covariance[:3, :3] = of_rotation
+        worst = float(np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1]))
+        if worst > np.radians(options.max_rotation_std_deg):
+            rejection = "indeterminate"
+        elif ambiguous:
+            rejection = "ambiguous"
+    return TwoViewEstimate(
+        rotation=rotation,
+        translation=refined.translation,
+        covariance=covariance,
+        inliers=matches[rows],
+        kind=kind,
+        rejection=rejection,
+        match_count=len(matches),
+        inlier_ratio=ratio,
+        triangulation_angle_deg=angle_deg,
+        significance=significance,
+        sigma_px=refined.sigma_px,
+    )
+
+
+def _in_front(points: Correspondences, rotation: Array, translation: Array, sigma_px: float) -> Array:
+    """Mask (M,) of points in front of both cameras, or too far to tell."""
+    near = inverse_depths(points, rotation, translation)
+    depth_j = (points.rays_i @ rotation.T)[:, 2] + near * translation[2]
+    unclear = points.mean_focal * np.abs(near) < SELECTION_SIGMAS * sigma_px
+    mask: Array = ((near > 0) & (depth_j > 0)) | unclear
+    return mask
+
+
+def _agreeing(
+    points: Correspondences, pose: tuple[Array, Array], sigma_px: float, max_error_px: float
+) -> int:
+    """How many points are within ``max_error_px`` of a pose and in front of it."""
+    close = np.abs(sampson_errors_px(points, *pose)) < max_error_px
+    return int(np.count_nonzero(close & _in_front(points, *pose, sigma_px)))
+
+
+def _same_pose(refined: RefinedPose, pose: tuple[Array, Array]) -> bool:
+    rotation_rad = angle_of(pose[0] @ refined.rotation.T)
+    direction_rad = angle_between(pose[1], refined.translation)
+    return bool(rotation_rad < TWIN_ROTATION_RAD and direction_rad < TWIN_DIRECTION_RAD)
+
+
+def _kind_of(
+    inliers: Correspondences,
+    refined: RefinedPose,
+    angle_deg: float,
+    selection_px: float,
+    options: EstimateTwoViewOptions,
+    seed: int,
+) -> tuple[str, bool]:
+    """The kind of the pair, and whether another pose explains its one plane as well."""
+    needed = options.planar_ratio * len(inliers)
+    if angle_deg < options.rotation_only_angle_deg:
+        rotation, _ = fit_rotation(inliers, refined.rotation, 1.0, SIGMA_FLOOR_PX)
+        errors = np.linalg.norm(transfer_errors_px(inliers, rotation), axis=1)
+        if np.count_nonzero(errors < selection_px) >= needed:
+            return "rotation_only", False
+    H, explained = fit_homography(inliers, selection_px, seed)
+    kind = "planar" if explained >= needed else "general"
+    if options.min_ambiguity_gap == 0 or explained < TWIN_PLANE_RATIO * len(inliers):
+        return kind, False
+    gaps = [_gap_to(inliers, refined, twin, selection_px, options) for twin in planar_twins(H)]
+    return kind, min(gaps, default=np.inf) < options.min_ambiguity_gap
+
+
+def _gap_to(
+    inliers: Correspondences,
+    refined: RefinedPose,
+    twin: tuple[Array, Array],
+    selection_px: float,
+    options: EstimateTwoViewOptions,
+) -> float:
+    """Log-likelihood of the inliers lost by another pose; infinite if it is no rival."""
+    scale = 2.0 * max(refined.sigma_px, TWIN_NOISE_FLOOR_PX)
+    if _same_pose(refined, twin):
+        return float("inf")
+    if _agreeing(inliers, twin, refined.sigma_px, 3.0 * selection_px) < TWIN_START_RATIO * len(inliers):
+        return float("inf")
+    rival = refine_pose(inliers, *twin, "sampson", selection_px, options.loss_scale)
+    found = (rival.rotation, rival.translation)
+    if _same_pose(refined, found):
+        return float("inf")
+    if _agreeing(inliers, found, rival.sigma_px, selection_px) < TWIN_INLIER_RATIO * len(inliers):
+        return float("inf")
+    own = sampson_errors_px(inliers, refined.rotation, refined.translation)
+    return 2.0 * (cauchy_cost(rival.errors_px, scale) - cauchy_cost(own, scale))

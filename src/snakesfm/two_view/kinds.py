@@ -1,0 +1,88 @@
+"""Degenerate motions and scenes: a plane, and a camera that only turns."""
+
+from typing import Any
+
+import cv2
+import numpy as np
+import poselib
+from numpy.typing import NDArray
+
+from snakesfm.geometry.rotations import exp_so3
+from snakesfm.two_view.covariance import cauchy_variance, invert_information
+from snakesfm.two_view.sampson import (
+    GENERATORS,
+    Correspondences,
+    cauchy_weights,
+    robust_sigma_px,
+    solve_damped,
+)
+
+Array = NDArray[Any]
+
+
+def fit_homography(points: Correspondences, max_error_px: float, seed: int) -> tuple[Array, int]:
+    """The homography (3,3) from rays i to rays j, and how many it explains in image j."""
+    if len(points) < 4:
+        return np.eye(3), len(points)
+    H, info = poselib.estimate_homography(
+        points.rays_i[:, :2] * points.focal_i,
+        points.rays_j[:, :2] * points.focal_j,
+        {"max_reproj_error": max_error_px, "min_iterations": 20, "max_iterations": 200, "seed": seed},
+        {},
+    )
+    scale_i, scale_j = (np.diag([focal, focal, 1.0]) for focal in (points.focal_i, points.focal_j))
+    return np.linalg.solve(scale_j, H @ scale_i), int(np.sum(info["inliers"]))
+
+
+def planar_twins(H: Array) -> list[tuple[Array, Array]]:
+    """The relative poses (3,3), unit (3,) that one plane seen as the homography H (3,3) of rays allows.
+
+    Source: Malis and Vargas, Deeper understanding of the homography decomposition, INRIA RR-6303, 2007.
+    """
+    if abs(np.linalg.det(H)) < 1e-12 or not np.isfinite(H).all():
+        return []
+    count, rotations, translations, _ = cv2.decomposeHomographyMat(H, np.eye(3))
+    twins = []
+    for row in range(count):
+        length = float(np.linalg.norm(translations[row]))
+        if np.isfinite(length) and length > 1e-6 and np.linalg.det(rotations[row]) > 0:
+            twins.append((np.asarray(rotations[row]), np.asarray(translations[row]).ravel() / length))
+    return twins
+
+
+def transfer_errors_px(points: Correspondences, rotation: Array) -> Array:
+    """Errors (M,2) in pixels of image j of the points of image i turned by ``rotation``."""
+    turned = points.rays_i @ rotation.T
+    depth = np.where(turned[:, 2] > 1e-6, turned[:, 2], np.nan)
+    errors = points.focal_j * (turned[:, :2] / depth[:, None] - points.rays_j[:, :2])
+    return np.nan_to_num(errors, nan=1e6)
+
+
+def fit_rotation(
+    points: Correspondences, rotation: Array, loss_scale: float, floor_px: float
+) -> tuple[Array, Array]:
+    """The rotation (3,3) alone that explains the correspondences best, and its covariance (3,3) in rad^2.
+
+    Gauss-Newton on the Cauchy loss of the transfer error, from a nearby rotation; the loss is scaled by
+    ``loss_scale`` times the measured noise, which is not taken below ``floor_px``.
+    """
+    for _ in range(10):
+        turned = points.rays_i @ rotation.T
+        inverse = 1.0 / np.maximum(turned[:, 2], 1e-6)
+        image = turned[:, :2] * inverse[:, None]
+        errors = points.focal_j * (image - points.rays_j[:, :2])
+        scale = loss_scale * robust_sigma_px(errors.ravel(), floor_px)
+        d_turned = np.stack([turned @ g.T for g in GENERATORS], axis=1)
+        # (M,3,2) flattened to one row per coordinate
+        jacobian = (
+            points.focal_j
+            * inverse[:, None, None]
+            * (d_turned[:, :, :2] - image[:, None, :] * d_turned[:, :, 2:])
+        )
+        rows = jacobian.transpose(0, 2, 1).reshape(-1, 3)
+        weighted = rows * np.repeat(cauchy_weights(np.linalg.norm(errors, axis=1), scale), 2)[:, None]
+        step = solve_damped(weighted.T @ rows, weighted.T @ errors.ravel())
+        rotation = exp_so3(step) @ rotation
+        if np.linalg.norm(step) < 1e-8:
+            break
+    return rotation, invert_information(rows.T @ rows / cauchy_variance(errors.ravel(), scale, 3))

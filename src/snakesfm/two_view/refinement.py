@@ -1,0 +1,121 @@
+"""Refinement of a robustly estimated relative pose, with its covariance and its noise."""
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+import poselib
+from numpy.typing import NDArray
+
+from snakesfm.two_view.bundle import refine_bundle
+from snakesfm.two_view.covariance import pose_covariance
+from snakesfm.two_view.estimators import poselib_camera
+from snakesfm.two_view.sampson import (
+    Correspondences,
+    refine_sampson,
+    robust_sigma_px,
+    sampson_errors_px,
+    sampson_jacobian,
+)
+
+Array = NDArray[Any]
+Refinement = Literal["none", "sampson", "bundle"]
+SIGMA_FLOOR_PX = 0.03
+NEAR_SIGMAS = 6.0
+
+
+@dataclass(frozen=True)
+class RefinedPose:
+    """A relative pose, how certain it is and how noisy its matches are.
+
+    Parameters
+    ----------
+    rotation, translation : (3,3) and unit (3,), j_from_i.
+    covariance : (5,5) in rad^2, in the parameters of ``tangents.perturb_pose``.
+    errors_px : (M,) signed Sampson errors of all correspondences.
+    sigma_px : robust standard deviation of the inliers' errors.
+    """
+
+    rotation: Array
+    translation: Array
+    covariance: Array
+    errors_px: Array
+    sigma_px: float
+
+
+def noise_px(errors: Array, reach_px: float) -> float:
+    """Robust standard deviation of the errors (M,) that lie within ``reach_px``."""
+    near = np.abs(errors) < reach_px
+    return robust_sigma_px(errors[near], SIGMA_FLOOR_PX)
+
+
+def refine_pose(
+    points: Correspondences,
+    rotation: Array,
+    translation: Array,
+    method: Refinement,
+    reach_px: float,
+    loss_scale: float,
+) -> RefinedPose:
+    """Refine a relative pose on the correspondences near it.
+
+    Parameters
+    ----------
+    points : all correspondences, outliers included.
+    method : ``none`` keeps the pose and only adds covariance and noise.
+    reach_px : Sampson error up to which correspondences tell the noise.
+    loss_scale : scale of the Cauchy loss in multiples of the measured noise.
+
+    The noise is measured and the pose refined twice, for a better pose shows less noise.
+    """
+    errors = sampson_errors_px(points, rotation, translation)
+    sigma = noise_px(errors, reach_px)
+    if method != "none":
+        for first in (True, False):
+            near = points.take(np.abs(errors) < max(NEAR_SIGMAS * sigma, SIGMA_FLOOR_PX))
+            rotation, translation = _refine(near, rotation, translation, method, loss_scale * sigma, first)
+            errors = sampson_errors_px(points, rotation, translation)
+            sigma = noise_px(errors, reach_px)
+    near = points.take(np.abs(errors) < NEAR_SIGMAS * sigma)
+    near_errors, jacobian = sampson_jacobian(near, rotation, translation)
+    covariance = pose_covariance(jacobian, near_errors, max(loss_scale, 1.0) * sigma)
+    return RefinedPose(rotation, translation, covariance, errors, sigma)
+
+
+def _refine(
+    points: Correspondences,
+    rotation: Array,
+    translation: Array,
+    method: Refinement,
+    scale_px: float,
+    far: bool,
+) -> tuple[Array, Array]:
+    if len(points) < 6:
+        return rotation, translation
+    if method == "bundle":
+        return refine_bundle(points, rotation, translation, scale_px, 10)
+    if far:
+        rotation, translation = _refine_poselib(points, rotation, translation, scale_px)
+    # PoseLib weighs both images alike; this weighs each by its focal length
+    return refine_sampson(points, rotation, translation, scale_px, 1 if far else 5)
+
+
+def _refine_poselib(
+    points: Correspondences, rotation: Array, translation: Array, scale_px: float
+) -> tuple[Array, Array]:
+    focal = points.mean_focal
+    camera = poselib_camera(focal)
+    start = poselib.CameraPose()
+    start.R, start.t = rotation, translation
+    pose, _ = poselib.refine_relative_pose(
+        points.rays_i[:, :2] * focal,
+        points.rays_j[:, :2] * focal,
+        start,
+        camera,
+        camera,
+        {"loss_type": "CAUCHY", "loss_scale": scale_px, "max_iterations": 20},
+    )
+    length = float(np.linalg.norm(pose.t))
+    if not np.isfinite(length) or length < 1e-12:
+        return rotation, translation
+    return np.asarray(pose.R), np.asarray(pose.t) / length

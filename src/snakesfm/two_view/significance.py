@@ -1,0 +1,44 @@
+"""How unlikely it is that a relative pose agrees with as many matches by chance."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import gammaln
+
+Array = NDArray[Any]
+LOG10 = float(np.log(10.0))
+
+
+def _log_choose(n: Array | float, k: Array | float) -> Any:
+    return gammaln(np.add(n, 1.0)) - gammaln(np.add(k, 1.0)) - gammaln(np.subtract(n, k) + 1.0)
+
+
+def significance_of(errors_px: Array, width_px: float, height_px: float, floor_px: float = 0.25) -> float:
+    """Minus log10 of the number of false alarms of a relative pose; larger is more significant.
+
+    Parameters
+    ----------
+    errors_px : (M,) distances of all matches to their epipolar lines, inliers and outliers.
+    width_px, height_px : extent of the area over which the matched keypoints lie.
+    floor_px : distances below this count as this, for keypoints are no points.
+
+    The number of matches that agree is the one for which chance is least likely, so no threshold is needed.
+    Source: Moisan and Stival, A probabilistic criterion to detect rigid point matches, IJCV 2004;
+    Moulon et al., Adaptive structure from motion with a contrario model estimation, ACCV 2012.
+    """
+    count = len(errors_px)
+    sample = 5
+    if count <= sample:
+        return 0.0
+    ordered = np.sort(np.maximum(np.abs(errors_px), floor_px))[sample:]
+    agreeing = np.arange(sample + 1, count + 1)
+    area = max(width_px * height_px, 1.0)
+    chance = np.minimum(1.0, 2.0 * ordered * np.hypot(width_px, height_px) / area)
+    log_alarms = (
+        np.log(count - sample)
+        + _log_choose(count, agreeing)
+        + _log_choose(agreeing, sample)
+        + (agreeing - sample) * np.log(chance)
+    )
+    return max(0.0, -float(log_alarms.min()) / LOG10)

@@ -1,0 +1,118 @@
+"""Clusters of images that cycles hold together, and the votes by which they are joined."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from snakesfm.geometry.rotations import angle_of
+from snakesfm.rotation_averaging.irls import IrlsAverager
+from snakesfm.view_graph.components import label_components
+
+Array = NDArray[Any]
+
+
+def join_clusters(
+    node_count: int, pairs: Array, rotations: Array, weights: Array, trusted: Array, tolerance_rad: float
+) -> tuple[Array, Array]:
+    """Choose the edges that join clusters: those that most of the inlier matches agree on.
+
+    The components of the trusted edges are clusters with rotations of their own. Every other edge between
+    two clusters votes, with its weight, for one rotation between them. The best supported joins are carried
+    out first; votes of several clusters then count together.
+
+    Parameters
+    ----------
+    node_count : N.
+    pairs : (E,2) int, sorted and unique.
+    rotations : (E,3,3) float64, j_from_i.
+    weights : (E,) float64, weight of each vote, such as the inlier count.
+    trusted : (E,) bool, edges that cycles confirm.
+    tolerance_rad : votes that differ by less agree.
+
+    Returns
+    -------
+    joining : (E,) bool, the edges that joined clusters. The components of these and the trusted edges are
+        those of all edges.
+    frames : (N,3,3) float64, rough cam_from_world rotations, one gauge per component.
+    """
+    joining = np.zeros(len(pairs), dtype=bool)
+    clusters = label_components(node_count, pairs[trusted]).astype(np.int64)
+    frames = _cluster_rotations(node_count, pairs, rotations, weights, trusted, clusters)
+    rounds = 0
+    while True:
+        open_edges = np.flatnonzero(clusters[pairs[:, 0]] != clusters[pairs[:, 1]])
+        if len(open_edges) == 0:
+            return joining, frames
+        heads, tails = pairs[open_edges].T
+        # of the smaller cluster's frame to the larger one's, so that all votes of a pair compare
+        votes = frames[tails].transpose(0, 2, 1) @ rotations[open_edges] @ frames[heads]
+        first, second = clusters[heads], clusters[tails]
+        flipped = first > second
+        votes = np.where(flipped[:, None, None], votes.transpose(0, 2, 1), votes)
+        low, high = np.minimum(first, second), np.maximum(first, second)
+        supports = _supports(low * node_count + high, votes, weights[open_edges], tolerance_rad)
+        winners = _mutually_best(low, high, supports, node_count, greedy=rounds >= 30)
+        for winner in winners:
+            if clusters[heads[winner]] == clusters[tails[winner]]:
+                continue
+            same = (low == low[winner]) & (high == high[winner])
+            apart = angle_of(votes[winner].T @ votes[same])
+            joining[open_edges[same][apart <= tolerance_rad]] = True
+            _merge(clusters, frames, heads[winner], tails[winner], rotations[open_edges[winner]])
+        rounds += 1
+
+
+def _cluster_rotations(
+    node_count: int, pairs: Array, rotations: Array, weights: Array, trusted: Array, clusters: Array
+) -> Array:
+    """Rotations (N,3,3) of every image in the frame of its cluster."""
+    frames = np.tile(np.eye(3), (node_count, 1, 1))
+    averager = IrlsAverager()
+    owners = clusters[pairs[:, 0]]
+    for cluster in range(int(np.count_nonzero(np.bincount(clusters) > 1))):
+        chosen = trusted & (owners == cluster)
+        members = clusters == cluster
+        averaged = averager.average(node_count, pairs[chosen], rotations[chosen], weights[chosen])
+        frames[members] = averaged[members]
+    return frames
+
+
+def _supports(keys: Array, votes: Array, weights: Array, tolerance_rad: float) -> Array:
+    """Weight (V,) of the votes of the same key that agree with each vote."""
+    order = np.argsort(keys, kind="stable")
+    _, starts, counts = np.unique(keys[order], return_index=True, return_counts=True)
+    supports = weights.astype(np.float64)
+    for start, count in zip(starts[counts > 1], counts[counts > 1], strict=True):
+        rows = order[start : start + count]
+        for row in rows:
+            agree = angle_of(votes[row].T @ votes[rows]) <= tolerance_rad
+            supports[row] = weights[rows][agree].sum()
+    return supports
+
+
+def _mutually_best(low: Array, high: Array, supports: Array, node_count: int, greedy: bool) -> Array:
+    """Votes that are the best of both their clusters, or of one where ``greedy``, best first."""
+    order = np.lexsort((high, low, -supports))
+    ranks = np.empty(len(order), dtype=np.int64)
+    ranks[order] = np.arange(len(order))
+    best = np.full(node_count, len(order), dtype=np.int64)
+    np.minimum.at(best, low, ranks)
+    np.minimum.at(best, high, ranks)
+    is_best = (best[low] == ranks).astype(int) + (best[high] == ranks)
+    chosen: Array = order[(is_best >= (1 if greedy else 2))[order]]
+    return chosen
+
+
+def _merge(clusters: Array, frames: Array, head: int, tail: int, rotation: Array) -> None:
+    """Take the smaller cluster of an edge into the larger one, in place."""
+    sizes = np.count_nonzero(clusters == clusters[head]), np.count_nonzero(clusters == clusters[tail])
+    if sizes[0] >= sizes[1]:
+        keep, move, target = clusters[head], clusters[tail], rotation @ frames[head]
+        turn = frames[tail].T @ target
+    else:
+        keep, move, target = clusters[tail], clusters[head], rotation.T @ frames[tail]
+        turn = frames[head].T @ target
+    moved = clusters == move
+    frames[moved] = frames[moved] @ turn
+    clusters[moved] = keep

@@ -1,0 +1,101 @@
+"""What every translation averager must do; each implementation inherits the suite."""
+
+import numpy as np
+import pytest
+
+from snakesfm.synthetic.problems import make_problem, perturb_rotations
+from snakesfm.translation_averaging.averagers import GlobalPositioning, ScaleChain, TranslationRecovery
+from snakesfm.translation_averaging.problem import PositioningProblem, edge_directions, world_rays
+
+
+def positioning_problem(problem, rotations=None, min_length=3):
+    rotations = problem.rotations if rotations is None else rotations
+    lengths = np.diff(problem.track_offsets)
+    rows = np.repeat(lengths >= min_length, lengths)
+    images = problem.track_image_ids[rows].astype(np.int64)
+    normalized = problem.cameras[0].normalize(problem.track_keypoints[rows])
+    return PositioningProblem(
+        image_count=problem.image_count,
+        pairs=problem.pairs.astype(np.int64),
+        directions=edge_directions(rotations, problem.pairs, problem.edge_translations),
+        sigmas_rad=np.sqrt(problem.edge_covariances[:, 3, 3]),
+        ray_images=images,
+        ray_tracks=np.repeat(np.arange(len(lengths)), lengths)[rows],
+        rays=world_rays(rotations, images, normalized),
+    )
+
+
+def center_errors(estimated, truth):
+    """Distances after scale and shift only: the frame of the rotations must be kept."""
+    known = np.isfinite(estimated[:, 0])
+    a = estimated[known] - np.median(estimated[known], axis=0)
+    b = truth[known] - np.median(truth[known], axis=0)
+    scale = np.sum(a * b) / np.sum(a * a)
+    assert scale > 0
+    shift = np.median(b - scale * a, axis=0)
+    return np.linalg.norm(scale * a + shift - b, axis=1)
+
+
+class TranslationAveragerContract:
+    averager = None
+    exact_tolerance = 1e-3
+    same_tolerance = 0.0
+
+    @pytest.mark.parametrize("layout", ["ring", "area", "facade"])
+    def test_exact_directions_give_exact_centers(self, layout):
+        truth = make_problem(20, 800, layout, noise_px=0.0, rotation_noise_deg=0.0)
+        centers = self.averager.position(positioning_problem(truth), 0)
+        assert centers.shape == (20, 3)
+        assert center_errors(centers, truth.centers).max() < self.exact_tolerance
+
+    def test_noise_and_outliers_give_errors_of_their_size(self):
+        truth = make_problem(25, 1200, "area", 1.0, 0.1, 0.3, 0.1, seed=2)
+        problem = positioning_problem(truth, perturb_rotations(truth.rotations, 0.2, 3))
+        errors = center_errors(self.averager.position(problem, 0), truth.centers)
+        assert 1e-3 < np.median(errors) < 0.1
+        assert errors.max() < 0.5
+
+    def test_images_outside_the_problem_stay_without_center(self):
+        truth = make_problem(15, 800, "area", noise_px=0.1)
+        problem = positioning_problem(truth)
+        inside = problem.select_edges((problem.pairs != 14).all(axis=1)).select_rays(
+            problem.ray_images != 14
+        )
+        centers = self.averager.position(inside, 0)
+        assert np.isnan(centers[14]).all()
+        assert np.isfinite(centers[:14]).all()
+
+    def test_same_seed_same_result(self):
+        truth = make_problem(15, 600, "facade", seed=5)
+        problem = positioning_problem(truth)
+        one, two = self.averager.position(problem, 7), self.averager.position(problem, 7)
+        scale = np.abs(one).max()
+        assert np.abs(one - two).max() <= self.same_tolerance * scale
+
+
+class TestScaleChain(TranslationAveragerContract):
+    averager = ScaleChain()
+
+
+class TestTranslationRecovery(TranslationAveragerContract):
+    averager = TranslationRecovery()
+
+
+class TestTranslationRecoveryMfas(TranslationAveragerContract):
+    averager = TranslationRecovery(reject_outliers="mfas")
+
+
+class TestTranslationRecoveryNone(TranslationAveragerContract):
+    averager = TranslationRecovery(reject_outliers="none")
+
+
+class TestGlobalPositioning(TranslationAveragerContract):
+    averager = GlobalPositioning()
+    exact_tolerance = 2e-2
+    same_tolerance = 1e-6
+
+
+class TestGlobalPositioningFromChain(TranslationAveragerContract):
+    averager = GlobalPositioning(start="chain")
+    exact_tolerance = 2e-2
+    same_tolerance = 1e-6

@@ -1,0 +1,118 @@
+"""What every triangulator must do."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from snakesfm.synthetic.problems import make_problem
+from snakesfm.triangulation.interface import TriangulationLimits, TriangulationProblem
+from snakesfm.triangulation.tracks import triangulator, undistort
+
+LIMITS = TriangulationLimits(max_reprojection_error_px=4.0, min_angle_deg=1.0)
+
+
+def as_problem(made):
+    rays = undistort(made.cameras, made.camera_ids, made.track_image_ids, made.track_keypoints)
+    focals = np.full(made.image_count, made.cameras[0].focal_px)
+    return TriangulationProblem(
+        made.rotations, made.translations, focals, made.track_offsets, made.track_image_ids, rays
+    )
+
+
+def errors_of(points, made):
+    found = np.isfinite(points[:, 0])
+    return np.linalg.norm(points[found] - made.points[found], axis=1), found
+
+
+class TriangulatorContract:
+    """Inherit and set ``method``."""
+
+    method = ""
+
+    @pytest.fixture
+    def triangulate(self):
+        return triangulator(self.method)
+
+    def test_exact_observations_give_exact_points(self, triangulate):
+        made = make_problem(12, 300, noise_px=0.0)
+        points, inliers = triangulate(as_problem(made), LIMITS)
+        errors, found = errors_of(points, made)
+        assert found.mean() > 0.95 and inliers[np.repeat(found, np.diff(made.track_offsets))].all()
+        assert np.median(errors) < 1e-4
+
+    def test_noise_gives_errors_of_its_size(self, triangulate):
+        made = make_problem(12, 300, noise_px=0.5)
+        points, _ = triangulate(as_problem(made), LIMITS)
+        errors, found = errors_of(points, made)
+        assert found.mean() > 0.9
+        assert 1e-4 < np.median(errors) < 0.05
+
+    def test_wrong_observations_are_left_out(self, triangulate):
+        made = make_problem(12, 400, noise_px=0.3, outlier_ratio=0.1, max_views=12)
+        points, inliers = triangulate(as_problem(made), LIMITS)
+        errors, found = errors_of(points, made)
+        used = np.repeat(found, np.diff(made.track_offsets))
+        right = ~made.track_outliers
+        long = np.repeat(np.diff(made.track_offsets) >= 4, np.diff(made.track_offsets))
+        assert inliers[used & right & long].mean() > 0.95
+        assert inliers[made.track_outliers & long].mean() < 0.08
+        assert np.median(errors) < 0.03
+
+    def test_points_behind_a_camera_are_refused(self, triangulate):
+        made = make_problem(12, 100, noise_px=0.0)
+        problem = as_problem(made)
+        turned = np.diag([1.0, -1.0, -1.0])
+        behind = replace(
+            problem, rotations=turned @ problem.rotations, translations=problem.translations @ turned
+        )
+        points, inliers = triangulate(behind, LIMITS)
+        assert np.isfinite(points[:, 0]).mean() < 0.2 and inliers.mean() < 0.2
+
+    def test_nearly_parallel_rays_give_no_point(self, triangulate):
+        made = make_problem(12, 200, noise_px=0.0)
+        points, inliers = triangulate(as_problem(made), replace(LIMITS, min_angle_deg=89.0))
+        assert np.isnan(points).all() and not inliers.any()
+
+    def test_empty_and_single_observations(self, triangulate):
+        made = as_problem(make_problem(5, 60))
+        empty = replace(
+            made, offsets=np.zeros(1, np.int64), image_ids=made.image_ids[:0], rays=made.rays[:0]
+        )
+        points, inliers = triangulate(empty, LIMITS)
+        assert points.shape == (0, 3) and inliers.shape == (0,)
+        single = replace(
+            made, offsets=np.array([0, 0, 1]), image_ids=made.image_ids[:1], rays=made.rays[:1]
+        )
+        points, inliers = triangulate(single, LIMITS)
+        assert np.isnan(points).all() and not inliers.any()
+
+    def test_deterministic_and_independent_of_other_tracks(self, triangulate):
+        made = as_problem(make_problem(12, 200, outlier_ratio=0.1))
+        points, inliers = triangulate(made, LIMITS)
+        again, same = triangulate(made, LIMITS)
+        np.testing.assert_array_equal(points, again)
+        np.testing.assert_array_equal(inliers, same)
+        half = len(made.offsets) // 2
+        end = made.offsets[half]
+        part = replace(
+            made,
+            offsets=made.offsets[: half + 1],
+            image_ids=made.image_ids[:end],
+            rays=made.rays[:end],
+        )
+        np.testing.assert_allclose(triangulate(part, LIMITS)[0], points[:half], atol=1e-9)
+
+
+class TestRansacDlt(TriangulatorContract):
+    method = "ransac_dlt"
+
+    def test_hypotheses_are_limited(self, triangulate):
+        made = make_problem(30, 100, noise_px=0.3, max_views=25, outlier_ratio=0.1)
+        points, _ = triangulate(as_problem(made), replace(LIMITS, max_hypotheses=5))
+        errors, found = errors_of(points, made)
+        assert found.mean() > 0.7 and np.median(errors) < 0.1
+
+
+class TestPycolmap(TriangulatorContract):
+    method = "pycolmap"

@@ -1,0 +1,456 @@
+"""export_model, evaluate_model and render_report on small artifacts with exact truth."""
+
+import csv
+import json
+import struct
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+from PIL import Image
+
+from snakesfm.artifacts import (
+    CameraRotations,
+    Header,
+    ImageIndex,
+    Reconstruction,
+    TrackTable,
+    TriangulatedPoints,
+    TwoViewGeometries,
+    ViewGraph,
+    write_json,
+)
+from snakesfm.config.evaluate_model import EvaluateModelOptions
+from snakesfm.config.export_model import ExportModelOptions
+from snakesfm.config.render_report import RenderReportOptions
+from snakesfm.evaluation.colmap_model import read_model
+from snakesfm.geometry.camera import Camera, cameras_to_columns
+from snakesfm.stages import evaluate_model, export_model, render_report
+from snakesfm.stages.job import StageJob
+from snakesfm.synthetic.problems import SyntheticProblem, make_problem
+
+COUNT = 9
+LOST = 8
+FILES = (
+    "sparse/0/cameras.bin",
+    "sparse/0/images.bin",
+    "sparse/0/points3D.bin",
+    "sparse/0/cameras.txt",
+    "sparse/0/images.txt",
+    "sparse/0/points3D.txt",
+    "points.ply",
+    "transforms.json",
+    "summary.json",
+)
+HEADER = Header("test", 1, "scene", '{"an": "option"}')
+NAMES = sorted(f"day 1/ü{k}#<b>{{}}.jpg" for k in range(COUNT))
+
+
+@pytest.fixture(scope="module")
+def problem() -> SyntheticProblem:
+    return make_problem(camera_count=COUNT, point_count=300, noise_px=0.3, camera=CAMERA)
+
+
+CAMERA = Camera("SIMPLE_RADIAL", 640, 480, (500.0, 320.0, 240.0, 0.02))
+
+
+def write_index(folder: Path, orientations: np.ndarray | None = None) -> Path:
+    folder.mkdir(exist_ok=True)
+    models, sizes, params, sources = cameras_to_columns([CAMERA, CAMERA])
+    ImageIndex(
+        names=NAMES,
+        sizes=np.tile([640, 480], (COUNT, 1)),
+        sha256=["0"] * COUNT,
+        blocks=np.zeros(COUNT, np.int32),
+        camera_ids=np.arange(COUNT) % 2,
+        orientations=np.ones(COUNT, np.int32) if orientations is None else orientations,
+        focal_exif_px=np.full(COUNT, np.nan),
+        gps=np.full((COUNT, 3), np.nan),
+        duplicate_of=np.full(COUNT, -1),
+        camera_models=models,
+        camera_sizes=sizes,
+        camera_params=params,
+        camera_sources=sources,
+        refused_names=["no <image>.jpg"],
+        refused_reasons=["It is a text file."],
+    ).write(folder / "index.h5", HEADER)
+    return folder / "index.h5"
+
+
+def write_reconstruction(folder: Path, problem: SyntheticProblem, lost: Iterable[int] = (LOST,)) -> Path:
+    """The truth as a finished model, ``lost`` images of it not registered."""
+    rotations, translations = problem.rotations.copy(), problem.translations.copy()
+    rotations[list(lost)], translations[list(lost)] = np.nan, np.nan
+    keep = ~np.isin(problem.track_image_ids, list(lost))
+    lengths = np.add.reduceat(keep.astype(int), problem.track_offsets[:-1])
+    seen = lengths > 0
+    models, sizes, params, _ = cameras_to_columns([CAMERA, CAMERA])
+    count = int(seen.sum())
+    Reconstruction(
+        camera_models=models,
+        camera_sizes=sizes,
+        camera_params=params,
+        rotations=rotations,
+        translations=translations,
+        points=problem.points[seen],
+        colors=np.arange(count * 3).reshape(-1, 3).astype(np.uint8),
+        errors_px=np.linspace(0.1, 0.5, count),
+        offsets=np.concatenate([[0], np.cumsum(lengths[seen])]),
+        image_ids=problem.track_image_ids[keep],
+        keypoint_ids=problem.track_keypoint_ids[keep],
+        keypoints=problem.track_keypoints[keep],
+        round_names=["10 px", "5 px"],
+        round_costs=np.array([[9.0, 4.0], [4.0, 3.5]]),
+        round_counts=np.array([[9, 300, 900], [8, 290, 850]]),
+        round_errors_px=np.array([0.6, 0.4]),
+    ).write(folder / "reconstruction.h5", HEADER)
+    return folder / "reconstruction.h5"
+
+
+def make_images(folder: Path) -> Path:
+    for name in NAMES:
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        Image.new("RGB", (64, 48), "red").save(folder / name)
+    return folder
+
+
+def export(
+    tmp_path: Path,
+    problem: SyntheticProblem,
+    orientations: np.ndarray | None = None,
+    lost: Iterable[int] = (LOST,),
+    **options: bool,
+) -> Path:
+    inputs = {
+        "index": str(write_index(tmp_path, orientations)),
+        "reconstruction": str(write_reconstruction(tmp_path, problem, lost)),
+    }
+    folder = tmp_path / "out" / "scene" / "export_model"
+    images = tmp_path / "photos"
+    if not images.exists():
+        make_images(images)
+    export_model.run(
+        StageJob(
+            "export_model",
+            "scene",
+            inputs,
+            tuple(folder / file for file in FILES),
+            ExportModelOptions(**options),
+            {"images": str(images)},
+        )
+    )
+    return folder
+
+
+def test_colmap_reads_what_was_reconstructed_from_binary_and_text(tmp_path, problem) -> None:
+    folder = export(tmp_path, problem)
+    assert all((folder / file).stat().st_size > 0 for file in FILES)
+    assert not [path for path in folder.iterdir() if path.name.startswith(".")]
+    text_only = tmp_path / "text"
+    text_only.mkdir()
+    for part in ("cameras", "images", "points3D"):
+        (text_only / f"{part}.txt").write_bytes((folder / "sparse/0" / f"{part}.txt").read_bytes())
+    for place in (folder / "sparse" / "0", text_only):
+        model = read_model(place)
+        assert sorted(model.reg_image_ids()) == [k + 1 for k in range(COUNT) if k != LOST]
+        for k, image in ((image_id - 1, image) for image_id, image in model.images.items()):
+            assert image.name == NAMES[k]
+            assert image.camera_id == k % 2 + 1
+            assert np.allclose(image.cam_from_world().rotation.matrix(), problem.rotations[k])
+            assert np.allclose(image.cam_from_world().translation, problem.translations[k])
+        assert np.allclose(model.points3D[3].xyz, problem.points[2])
+        assert model.points3D[3].color.tolist() == [6, 7, 8]
+        assert model.points3D[1].error == pytest.approx(0.1)
+        assert model.num_points3D() == len(problem.points)
+        element = model.points3D[5].track.elements[0]
+        observed = model.images[element.image_id].points2D[element.point2D_idx]
+        assert observed.point3D_id == 5
+        row = np.flatnonzero(problem.track_image_ids[slice(*problem.track_offsets[4:6])] != LOST)[0]
+        expected = problem.track_keypoints[problem.track_offsets[4] + row]
+        assert observed.xy == pytest.approx(expected, abs=1e-5)
+
+
+def test_reprojection_in_the_exported_model_is_that_of_the_noise(tmp_path, problem) -> None:
+    pinhole = make_problem(camera_count=COUNT, point_count=300, noise_px=0.3, camera=CAMERA)
+    model = pycolmap.Reconstruction(str(export(tmp_path, pinhole) / "sparse" / "0"))
+    model.update_point_3d_errors()
+    assert 0.2 < model.compute_mean_reprojection_error() < 0.6
+
+
+def test_transforms_have_opengl_axes_in_the_world_of_the_points(tmp_path, problem) -> None:
+    folder = export(tmp_path, problem)
+    content = json.loads((folder / "transforms.json").read_text("utf-8"))
+    assert content["camera_model"] == "OPENCV"
+    assert content["applied_transform"] == np.eye(4)[:3].tolist()
+    assert (folder / content["ply_file_path"]).is_file()
+    assert len(content["frames"]) == COUNT - 1
+    for frame in content["frames"]:
+        k = frame["colmap_im_id"] - 1
+        assert (folder / frame["file_path"]).is_file()
+        pose = np.array(frame["transform_matrix"])
+        assert np.linalg.det(pose[:3, :3]) == pytest.approx(1.0)
+        local = np.linalg.inv(pose) @ np.append(problem.points[0], 1.0)
+        expected = problem.rotations[k] @ problem.points[0] + problem.translations[k]
+        assert local[:3] == pytest.approx(expected * [1, -1, -1])
+        assert (frame["fl_x"], frame["cx"], frame["k1"], frame["k2"]) == (500.0, 320.0, 0.02, 0.0)
+
+
+def test_points_are_in_the_ply_with_their_colours(tmp_path, problem) -> None:
+    data = (export(tmp_path, problem) / "points.ply").read_bytes()
+    head, body = data.split(b"end_header\n")
+    assert f"element vertex {len(problem.points)}".encode() in head
+    rows = np.frombuffer(body, np.dtype([("xyz", "<f4", 3), ("rgb", "u1", 3)]))
+    order = np.lexsort(problem.points.T)
+    found = np.lexsort(rows["xyz"].T.astype(np.float64))
+    assert np.allclose(rows["xyz"][found], problem.points[order], atol=1e-4)
+
+
+def test_summary_says_what_is_there_and_what_is_missing(tmp_path, problem) -> None:
+    summary = json.loads((export(tmp_path, problem) / "summary.json").read_text("utf-8"))
+    assert (summary["images"], summary["registered_images"]) == (COUNT, COUNT - 1)
+    assert summary["not_registered"] == [NAMES[LOST]]
+    assert summary["points"] == len(problem.points)
+    assert 0.1 < summary["mean_reprojection_error_px"] < 0.5
+    assert summary["mean_track_length"] == pytest.approx(summary["observations"] / summary["points"])
+    assert len(summary["warnings"]) == 1
+    assert "spaces" in summary["warnings"][0]
+
+
+def test_images_are_one_relative_link_and_a_second_run_gives_the_same_bytes(tmp_path, problem) -> None:
+    folder = export(tmp_path, problem)
+    link = folder / "images"
+    assert link.is_symlink()
+    assert not link.readlink().is_absolute()
+    before = {file: (folder / file).read_bytes() for file in FILES}
+    export(tmp_path, problem)
+    assert before == {file: (folder / file).read_bytes() for file in FILES}
+    assert (link / NAMES[0]).is_file()
+    tmp_path.rename(tmp_path.with_name("moved"))
+    assert (tmp_path.with_name("moved") / "out/scene/export_model/images" / NAMES[0]).is_file()
+    tmp_path.with_name("moved").rename(tmp_path)
+
+
+def test_images_are_copied_where_links_cannot_be_made(tmp_path, problem, monkeypatch) -> None:
+    def refuse(*_: object) -> None:
+        raise OSError("no links here")
+
+    monkeypatch.setattr(Path, "symlink_to", refuse)
+    folder = export(tmp_path, problem)
+    assert not (folder / "images").is_symlink()
+    assert (folder / "images" / NAMES[1]).read_bytes() == (tmp_path / "photos" / NAMES[1]).read_bytes()
+
+
+def test_an_image_that_exif_turns_is_upright_beside_the_model(tmp_path, problem) -> None:
+    photos = make_images(tmp_path / "photos")
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    Image.new("RGB", (48, 64), "blue").save(photos / NAMES[2], exif=exif)
+    orientations = np.ones(COUNT, np.int32)
+    orientations[2] = 6
+    folder = export(tmp_path, problem, orientations)
+    with Image.open(folder / "images" / NAMES[2]) as upright:
+        assert upright.size == (64, 48)
+        assert upright.getexif().get(0x0112, 1) == 1
+    assert (folder / "images" / NAMES[1]).is_symlink()
+    assert (photos / NAMES[2]).is_file()
+    export(tmp_path, problem)
+    assert (folder / "images").is_symlink()
+
+
+def test_undistorted_images_have_pinhole_cameras_and_go_when_no_longer_asked_for(tmp_path, problem) -> None:
+    photos = tmp_path / "photos"
+    for name in NAMES:
+        (photos / name).parent.mkdir(parents=True, exist_ok=True)
+        Image.new("RGB", (640, 480), "red").save(photos / name)
+    folder = export(tmp_path, problem, undistort=True)
+    model = pycolmap.Reconstruction(str(folder / "undistorted" / "sparse" / "0"))
+    assert {camera.model_name for camera in model.cameras.values()} == {"PINHOLE"}
+    assert model.num_reg_images() == COUNT - 1
+    assert model.num_points3D() == len(problem.points)
+    assert len(list((folder / "undistorted" / "images").rglob("*.jpg"))) == COUNT - 1
+    export(tmp_path, problem)
+    assert not (folder / "undistorted").exists()
+
+
+def test_the_binary_files_have_the_layout_of_colmap_3(tmp_path, problem) -> None:
+    sparse = export(tmp_path, problem) / "sparse" / "0"
+    cameras = (sparse / "cameras.bin").read_bytes()
+    assert struct.unpack_from("<QiiQQ4d", cameras) == (2, 1, 2, 640, 480, *CAMERA.params)
+    images = (sparse / "images.bin").read_bytes()
+    count, image_id, *pose, camera_id = struct.unpack_from("<Qi7di", images)
+    assert (count, image_id, camera_id) == (COUNT - 1, 1, 1)
+    assert pose[4:] == pytest.approx(problem.translations[0])
+    name = images[72 : images.index(b"\0", 72)]
+    assert name.decode() == NAMES[0]
+    points = (sparse / "points3D.bin").read_bytes()
+    count, point_id, *xyz, red, green, blue, error, length = struct.unpack_from("<QQ3d3BdQ", points)
+    assert (count, point_id, red, green, blue) == (len(problem.points), 1, 0, 1, 2)
+    assert xyz == pytest.approx(problem.points[0])
+    assert error == pytest.approx(0.1)
+    assert 1 <= length <= COUNT
+
+
+def evaluate(
+    tmp_path: Path, problem: SyntheticProblem, reference: str, lost: Iterable[int] = (LOST,)
+) -> tuple[dict, dict]:
+    folder = tmp_path / "evaluate_model"
+    inputs = {
+        "index": str(write_index(tmp_path)),
+        "reconstruction": str(write_reconstruction(tmp_path, problem, lost)),
+    }
+    evaluate_model.run(
+        StageJob(
+            "evaluate_model",
+            "scene",
+            inputs,
+            (folder / "metrics.json", folder / "metrics.csv"),
+            EvaluateModelOptions(),
+            {"reference": reference},
+        )
+    )
+    with (folder / "metrics.csv").open(encoding="utf-8", newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 1
+    return json.loads((folder / "metrics.json").read_text("utf-8")), rows[0]
+
+
+def test_evaluation_against_the_exported_truth(tmp_path, problem) -> None:
+    truth = export(tmp_path, problem, lost=())
+    metrics, row = evaluate(tmp_path, problem, str(truth))
+    assert metrics["reference_images"] == COUNT
+    assert metrics["reference_images_registered"] == COUNT - 1
+    assert metrics["relative_pose_auc_5deg"] == pytest.approx(100 * 8 * 7 / 72, abs=1e-3)
+    assert metrics["pose_auc_2.5deg"] == pytest.approx(100 * 8 / 9, abs=1e-3)
+    assert metrics["per_image"][NAMES[LOST]]["position_error"] is None
+    assert metrics["per_image"][NAMES[0]]["position_error"] == pytest.approx(0.0, abs=1e-6)
+    assert float(row["relative_pose_auc_5deg"]) == metrics["relative_pose_auc_5deg"]
+    assert set(row) == set(metrics) - {"per_image", "reference"}
+
+
+def test_evaluation_without_a_reference_has_the_columns_that_need_none(tmp_path, problem) -> None:
+    metrics, row = evaluate(tmp_path, problem, "")
+    assert metrics["registered_images"] == COUNT - 1
+    assert metrics["points"] == len(problem.points)
+    assert not [name for name in row if "auc" in name]
+
+
+def write_former_stages(folder: Path, problem: SyntheticProblem) -> dict[str, object]:
+    """What the report reads of the stages before: image LOST has only refused pairs."""
+    pairs, edges = problem.pairs, len(problem.pairs)
+    lost = (pairs == LOST).any(axis=1)
+    TwoViewGeometries(
+        pairs=pairs,
+        digests=["0"] * edges,
+        rotations=problem.edge_rotations,
+        translations=problem.edge_translations,
+        covariances=problem.edge_covariances,
+        kinds=np.zeros(edges, np.int8),
+        rejections=np.where(lost, 3, 0),
+        match_counts=problem.edge_inlier_counts + 10,
+        inlier_counts=problem.edge_inlier_counts,
+        inlier_ratios=np.full(edges, 0.5),
+        triangulation_angles_deg=problem.edge_angles_deg,
+        offsets=problem.match_offsets,
+        inliers=problem.matches,
+    ).write(folder / "geometries.h5", HEADER)
+    kept = ~lost
+    ViewGraph(
+        pairs=pairs[kept],
+        rotations=problem.edge_rotations[kept],
+        translations=problem.edge_translations[kept],
+        covariances=problem.edge_covariances[kept],
+        kinds=np.zeros(kept.sum(), np.int8),
+        inlier_counts=problem.edge_inlier_counts[kept],
+        triangulation_angles_deg=problem.edge_angles_deg[kept],
+        labels=np.where(np.arange(kept.sum()) == 0, 2, 0),
+        cycle_min_deg=np.ones(kept.sum()),
+        cycle_median_deg=np.ones(kept.sum()),
+        components=np.where(np.arange(COUNT) == LOST, 1, 0),
+    ).write(folder / "graph.h5", HEADER)
+    rotations = problem.rotations.copy()
+    rotations[LOST] = np.nan
+    CameraRotations(
+        rotations=rotations,
+        residuals_deg=np.full(kept.sum(), 0.25),
+        labels=np.zeros(kept.sum(), np.int8),
+    ).write(folder / "rotations.h5", HEADER)
+    keypoints = problem.track_keypoints
+    TrackTable(
+        offsets=problem.track_offsets,
+        image_ids=problem.track_image_ids,
+        keypoint_ids=problem.track_keypoint_ids,
+        keypoints=keypoints,
+        colors=np.zeros((len(keypoints), 3), np.uint8),
+    ).write(folder / "tracks.h5", HEADER)
+    TriangulatedPoints(
+        points=problem.points,
+        offsets=problem.track_offsets,
+        image_ids=problem.track_image_ids,
+        keypoint_ids=problem.track_keypoint_ids,
+        keypoints=keypoints,
+        colors=np.zeros((len(problem.points), 3), np.uint8),
+    ).write(folder / "points.h5", HEADER)
+    times = folder / "benchmarks" / "match_pairs" / "0-0.tsv"
+    times.parent.mkdir(parents=True)
+    times.write_text("s\th:m:s\tmax_rss\n12.5\t0:00:12\t321.0\n", "utf-8")
+    names = ("graph", "rotations", "tracks", "points", "index", "reconstruction")
+    inputs: dict[str, object] = {name: str(folder / f"{name}.h5") for name in names}
+    return {**inputs, "geometries": [str(folder / "geometries.h5")], "benchmarks": [str(times)]}
+
+
+def report(
+    tmp_path: Path,
+    problem: SyntheticProblem,
+    reference: str,
+    lost: Iterable[int] = (LOST,),
+    **options: int,
+) -> str:
+    evaluate(tmp_path, problem, reference, lost)
+    inputs = write_former_stages(tmp_path, problem)
+    inputs["metrics"] = str(tmp_path / "evaluate_model" / "metrics.json")
+    write_json(tmp_path / "summary.json", {"warnings": ["camera 1: look <here>"]})
+    inputs["summary"] = str(tmp_path / "summary.json")
+    output = tmp_path / "index.html"
+    render_report.run(
+        StageJob("render_report", "a <scene>", inputs, (output,), RenderReportOptions(**options))
+    )
+    return output.read_text("utf-8")
+
+
+def test_report_says_what_happened_and_escapes_names(tmp_path, problem) -> None:
+    page = report(tmp_path, problem, str(export(tmp_path, problem, lost=())))
+    assert "8 of 9 images registered" in page
+    assert "a &lt;scene&gt;" in page
+    assert "#<b>" not in page
+    assert "#&lt;b&gt;" in page
+    assert "no &lt;image&gt;.jpg" in page
+    assert "look &lt;here&gt;" in page
+    lost = int((problem.pairs == LOST).any(axis=1).sum())
+    assert f"None of its {lost} pairs was accepted: too few inliers ({lost})." in page
+    assert "cycle_median" in page
+    assert "12.5" in page
+    assert "relative pose AUC" in page
+    assert page.count("<title>") >= 2 * 8
+    assert "http" not in page.replace("http-equiv", "")
+    assert len(page) < 1_000_000
+
+
+def test_report_without_reference_shows_at_most_the_asked_rows(tmp_path, problem) -> None:
+    page = report(tmp_path, problem, "", max_images=3)
+    assert "The 3 images with the fewest observations of 9." in page
+    assert "relative pose AUC" not in page
+
+
+def test_a_scene_without_registered_images_is_exported_evaluated_and_reported(tmp_path, problem) -> None:
+    everything = range(COUNT)
+    truth = export(tmp_path / "truth", problem, lost=())
+    folder = export(tmp_path, problem, lost=everything)
+    summary = json.loads((folder / "summary.json").read_text("utf-8"))
+    assert (summary["registered_images"], summary["mean_reprojection_error_px"]) == (0, 0.0)
+    assert pycolmap.Reconstruction(str(folder / "sparse" / "0")).num_reg_images() == 0
+    page = report(tmp_path, problem, str(truth), lost=everything)
+    assert "0 of 9 images registered" in page
+    assert "No image is registered." in page
+    assert "Bundle adjustment dropped it" in page

@@ -1,0 +1,120 @@
+import numpy as np
+import pytest
+
+from snakesfm.geometry.camera import Camera
+from snakesfm.ingest.cameras import Photograph, assign_cameras, group_images
+from snakesfm.ingest.exif import Exif
+
+PHONE = Exif("DJI", "FC6310", focal_mm=8.8)
+PHONE_FOCAL = 8.8 / 13.2
+
+
+def photos(folder, sizes, exif=None):
+    exif = exif or Exif()
+    return [Photograph(f"{folder}/{k:03}.jpg", w, h, exif) for k, (w, h) in enumerate(sizes)]
+
+
+def assign(photographs, known=None, **changes):
+    rules = {"sharing": "auto", "model": "SIMPLE_RADIAL", "default_focal_ratio": 1.2, "use_exif": True}
+    return assign_cameras(photographs, known or [None] * len(photographs), **(rules | changes))
+
+
+def group_sizes(photographs, sharing="auto"):
+    keys = group_images(photographs, sharing)
+    return sorted(keys.count(key) for key in set(keys))
+
+
+def test_one_exif_camera_is_shared_over_folders_and_orientations():
+    found = assign(photos("a", [(4000, 3000)] * 3, PHONE) + photos("b", [(4000, 3000)] * 2, PHONE))
+    assert found.camera_ids.tolist() == [0] * 5
+    (camera,) = found.cameras
+    assert (camera.model, camera.width, camera.height, camera.source) == (
+        "SIMPLE_RADIAL",
+        4000,
+        3000,
+        "exif",
+    )
+    assert camera.params == pytest.approx((PHONE_FOCAL * 4000, 2000, 1500, 0), rel=1e-5)
+    np.testing.assert_allclose(found.focal_exif_px, PHONE_FOCAL * 4000, rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    "change", [{"focal_mm": 10.0}, {"lens": "wide"}, {"model": "FC330"}, {"make": "X"}]
+)
+def test_other_lens_focal_length_or_body_is_another_camera(change):
+    other = Exif(**({"make": "DJI", "model": "FC6310", "focal_mm": 8.8} | change))
+    found = assign(photos("a", [(4000, 3000)] * 2, PHONE) + photos("b", [(4000, 3000)] * 2, other))
+    assert found.camera_ids.tolist() == [0, 0, 1, 1]
+
+
+def test_video_without_exif_shares_one_default_camera_per_folder():
+    found = assign(photos("a", [(1280, 720)] * 3) + photos("b", [(640, 480)] * 2))
+    assert found.camera_ids.tolist() == [0, 0, 0, 1, 1]
+    assert [camera.source for camera in found.cameras] == ["default"] * 2
+    assert found.cameras[0].focal_px == pytest.approx(1.2 * 1280)
+    assert np.isnan(found.focal_exif_px).all()
+
+
+def test_portrait_and_landscape_of_one_camera_are_two_cameras():
+    assert group_sizes(photos("a", [(800, 600), (600, 800), (800, 600)])) == [1, 2]
+
+
+def test_crowd_photographs_have_a_camera_each():
+    assert group_sizes(photos("a", [(1024, 768), (1024, 683), (1024, 768)])) == [1, 1, 1]
+    bodies = photos("a", [(1024, 683)], PHONE) + photos("a", [(1024, 683)], Exif("X", "Y"))
+    assert group_sizes(bodies + photos("a", [(1024, 768)] * 3)) == [1] * 5
+
+
+def test_two_videos_in_one_folder_are_two_cameras():
+    assert group_sizes(photos("a", [(1920, 1080)] * 30 + [(1280, 720)] * 20)) == [20, 30]
+
+
+def test_cropped_images_are_not_trusted():
+    square = assign(photos("a", [(760, 760)] * 3, PHONE))
+    assert len(square.cameras) == 3
+    assert {camera.source for camera in square.cameras} == {"default"}
+    assert square.cameras[0].focal_px == pytest.approx(1.2 * 760)
+    assert np.isnan(square.focal_exif_px).all()
+
+
+def test_one_size_of_many_cameras_is_not_trusted():
+    mixed = [Photograph(f"{k}.jpg", 760, 1140, Exif("X", f"M{k}", focal_35mm=100)) for k in range(6)]
+    found = assign(mixed)
+    assert {camera.source for camera in found.cameras} == {"default"}
+    # cropping narrows the view, so the stated focal length is a lower bound
+    assert found.cameras[0].focal_px == pytest.approx(100 * np.hypot(760, 1140) / np.hypot(36, 24))
+    three = assign(mixed[:3])
+    assert {camera.source for camera in three.cameras} == {"exif"}
+
+
+@pytest.mark.parametrize(
+    ("sharing", "sizes"),
+    [("single", [1, 5]), ("per_folder", [1, 2, 3]), ("per_image", [1] * 6), ("exif", [1, 1, 1, 3])],
+)
+def test_fixed_rules(sharing, sizes):
+    images = (
+        photos("a", [(800, 600)] * 3, PHONE) + photos("b", [(800, 600)] * 2) + photos("c", [(640, 480)])
+    )
+    assert group_sizes(images, sharing) == sizes
+
+
+def test_options_of_unknown_cameras():
+    images = photos("a", [(800, 600)] * 2, PHONE)
+    found = assign(images, model="OPENCV", use_exif=False, default_focal_ratio=0.9)
+    assert found.cameras == [Camera("OPENCV", 800, 600, (720, 720, 400, 300, 0, 0, 0, 0), "default")]
+    assert np.isnan(found.focal_exif_px).all()
+
+
+def test_known_cameras_are_kept_beside_unknown_ones():
+    known = Camera("PINHOLE", 800, 600, (700, 701, 400, 300))
+    images = photos("a", [(800, 600)] * 4, PHONE)
+    found = assign(images, [known, None, Camera("PINHOLE", 800, 600, (700, 701, 400, 300)), None])
+    assert found.camera_ids.tolist() == [0, 1, 0, 1]
+    assert [camera.source for camera in found.cameras] == ["given", "exif"]
+    assert found.cameras[0] is known
+
+
+def test_no_images():
+    found = assign([])
+    assert found.cameras == []
+    assert len(found.camera_ids) == len(found.focal_exif_px) == 0

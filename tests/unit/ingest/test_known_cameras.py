@@ -1,0 +1,130 @@
+import cv2  # noqa: F401 - before pycolmap
+import pycolmap
+import pytest
+
+from snakesfm.errors import ConfigError
+from snakesfm.ingest.known import match_known_cameras, read_known_cameras
+
+TWO = "# comment\n1 PINHOLE 800 600 700 701 400 300\n\n7 SIMPLE_RADIAL 640 480 500 320 240 -0.1\n"
+SAME = "1 PINHOLE 800 600 700 701 400 300\n2 PINHOLE 800 600 710 711 400 300\n"
+POSE = "1 0 0 0 0 0 0"
+
+
+def write(folder, **files):
+    folder.mkdir(exist_ok=True)
+    for name, text in files.items():
+        (folder / f"{name}.txt").write_text(text, "utf-8")
+    return folder
+
+
+def match(known, images):
+    return match_known_cameras(known, list(images), list(images.values()))
+
+
+def test_one_camera_is_that_of_all_images_and_scales(tmp_path):
+    known = read_known_cameras(write(tmp_path, cameras=TWO.splitlines()[1]) / "cameras.txt")
+    same, half, odd = match(known, {"a.jpg": (800, 600), "b.jpg": (400, 300), "c.jpg": (267, 200)})
+    assert (same.model, same.params, same.source) == ("PINHOLE", (700, 701, 400, 300), "given")
+    assert half.params == (350, 350.5, 200, 150)
+    assert (odd.width, odd.height) == (267, 200)
+    assert odd.params == pytest.approx((700 * 267 / 800, 701 / 3, 133.5, 100))
+    with pytest.raises(ConfigError, match=r"turned\.jpg has 600 x 800 .*EXIF rotation"):
+        match(known, {"turned.jpg": (600, 800)})
+    with pytest.raises(ConfigError, match=r"wide\.jpg has 800 x 450 "):
+        match(known, {"wide.jpg": (800, 450)})
+
+
+def test_several_cameras_without_a_list_go_by_size(tmp_path):
+    known = read_known_cameras(write(tmp_path, cameras=TWO))
+    found = match(known, {"a.jpg": (640, 480), "b.jpg": (800, 600)})
+    assert [camera.model for camera in found] == ["SIMPLE_RADIAL", "PINHOLE"]
+    with pytest.raises(ConfigError, match=r"2 cameras, of which 0 .* 400 x 300 of c\.jpg"):
+        match(known, {"c.jpg": (400, 300)})
+    with pytest.raises(ConfigError, match="2 cameras, of which 2 "):
+        match(read_known_cameras(write(tmp_path, cameras=SAME)), {"a.jpg": (800, 600)})
+
+
+def test_list_of_images_decides(tmp_path):
+    images = f"# list\n3 {POSE} 2 sub/a b.jpg\n1.5 2.5 -1 3 4 17\n4 {POSE} 1 c.jpg\n\n"
+    known = read_known_cameras(write(tmp_path, cameras=SAME, images=images))
+    assert known.camera_of == {"sub/a b.jpg": 2, "c.jpg": 1}
+    found = match(known, {"c.jpg": (800, 600), "new.jpg": (800, 600), "sub/a b.jpg": (400, 300)})
+    assert found[0].params[0] == 700
+    assert found[1] is None
+    assert found[2].params[0] == 355
+
+
+def test_image_missing_from_the_list_takes_the_one_camera_of_its_size(tmp_path):
+    known = read_known_cameras(write(tmp_path, cameras=TWO, images=f"1 {POSE} 1 a.jpg\n\n"))
+    found = match(known, {"a.jpg": (800, 600), "b.jpg": (640, 480), "c.jpg": (100, 100)})
+    assert [camera and camera.model for camera in found] == ["PINHOLE", "SIMPLE_RADIAL", None]
+
+
+def test_binary_model_says_the_same_as_text(tmp_path):
+    model = pycolmap.Reconstruction()
+    for camera_id, name in ((3, "OPENCV"), (5, "SIMPLE_PINHOLE")):
+        camera = pycolmap.Camera.create_from_model_name(camera_id, name, 500.0 + camera_id, 640, 480)
+        model.add_camera_with_trivial_rig(camera)
+    for image_id, name in ((1, "a b.jpg"), (2, "ü/c.jpg")):
+        image = pycolmap.Image(name=name, camera_id=3 if image_id == 1 else 5, image_id=image_id)
+        image.points2D = pycolmap.Point2DList([pycolmap.Point2D([1.0, 2.0])] * image_id)
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d())
+    (tmp_path / "bin").mkdir()
+    (tmp_path / "txt").mkdir()
+    model.write_binary(tmp_path / "bin")
+    model.write_text(tmp_path / "txt")
+    binary = read_known_cameras(tmp_path / "bin")
+    text = read_known_cameras(tmp_path / "txt" / "cameras.txt")
+    assert binary.path.name == "cameras.bin"
+    assert binary.cameras == text.cameras
+    assert binary.camera_of == text.camera_of == {"a b.jpg": 3, "ü/c.jpg": 5}
+    data = (tmp_path / "bin" / "cameras.bin").read_bytes()
+    (tmp_path / "bin" / "cameras.bin").write_bytes(data[:-5])
+    with pytest.raises(ConfigError, match="neither COLMAP cameras nor a 3x3 matrix"):
+        read_known_cameras(tmp_path / "bin")
+
+
+def test_matrix(tmp_path):
+    known = read_known_cameras(write(tmp_path, K="700 0 400\n0 701 300\n0 0 1\n") / "K.txt")
+    first, half = match(known, {"a.jpg": (800, 600), "b.jpg": (400, 300)})
+    assert (first.model, first.width, first.params) == ("PINHOLE", 800, (700, 701, 400, 300))
+    assert half.params == (350, 350.5, 200, 150)
+    with pytest.raises(ConfigError, match="no scaling"):
+        match(known, {"a.jpg": (800, 600), "b.jpg": (600, 800)})
+    with pytest.raises(ConfigError, match="outside the images of 200 x 150"):
+        match(known, {"a.jpg": (200, 150)})
+    assert match(known, {}) == []
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "message"),
+    [
+        ("cameras", "", "holds no camera"),
+        ("cameras", "hello world", "neither COLMAP"),
+        ("cameras", "1 PINHOLE 800 600 700 x 400 300", "neither COLMAP"),
+        ("cameras", "1 PINHOLE 800 600 700 400 300", "parameters of a PINHOLE"),
+        ("cameras", "1 PINHOLE 800 600 -700 700 400 300", "parameters of a PINHOLE"),
+        ("cameras", "1 PINHOLE 800 600 nan 700 400 300", "parameters of a PINHOLE"),
+        ("cameras", "1 PINHOLE 0 600 700 700 400 300", "parameters of a PINHOLE"),
+        ("cameras", "1 LEICA 800 600 700 700 400 300", "'LEICA', which COLMAP does not know"),
+        ("K", "700 0 400\n0 701 300\n0 0 2\n", "no matrix"),
+        ("K", "700 50 400\n0 701 300\n0 0 1\n", "no matrix"),
+        ("K", "nan 0 400\n0 701 300\n0 0 1\n", "no matrix"),
+    ],
+)
+def test_wrong_files_are_one_sentence(tmp_path, name, text, message):
+    with pytest.raises(ConfigError, match=message) as caught:
+        read_known_cameras(write(tmp_path, **{name: text}) / f"{name}.txt")
+    assert f"{name}.txt" in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_missing_files_and_wrong_lists(tmp_path):
+    with pytest.raises(ConfigError, match="does not exist"):
+        read_known_cameras(tmp_path / "cameras.txt")
+    with pytest.raises(ConfigError, match=r"holds none of cameras\.bin"):
+        read_known_cameras(tmp_path)
+    with pytest.raises(ConfigError, match="camera 9, which it lacks"):
+        read_known_cameras(write(tmp_path, cameras=TWO, images=f"1 {POSE} 9 a.jpg\n\n"))
+    with pytest.raises(ConfigError, match=r"images\.txt.* is no COLMAP list"):
+        read_known_cameras(write(tmp_path, cameras=TWO, images="a.jpg\n"))

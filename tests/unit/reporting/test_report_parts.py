@@ -1,0 +1,203 @@
+"""Reasons, counts and plots of the report."""
+
+import base64
+import re
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from snakesfm.geometry.camera import Camera
+from snakesfm.geometry.poses import translation_of
+from snakesfm.geometry.rotations import exp_so3
+from snakesfm.reporting.plots import error_histogram, scene_map, view_axes
+from snakesfm.reporting.registration import (
+    ImageCounts,
+    mean_by_image,
+    observation_errors,
+    reason_not_registered,
+)
+from snakesfm.reporting.tables import image_rows, label_counts, metric_tables, stage_times
+from snakesfm.synthetic.layouts import look_at
+from snakesfm.synthetic.problems import make_problem
+
+
+def counts(**changes: object) -> ImageCounts:
+    """Counts of three images; image 0 passed every step but was not registered."""
+    values: dict[str, object] = {
+        "pairs": [5, 5, 5],
+        "accepted": [4, 4, 4],
+        "kept": [3, 3, 3],
+        "components": [0, 0, 0],
+        "rotated": [True] * 3,
+        "track_observations": [9, 9, 9],
+        "point_observations": [8, 8, 8],
+        "registered": [False, True, True],
+        "observations": [0, 7, 2],
+        "mean_error_px": [np.nan, 0.5, 0.6],
+    } | changes
+    return ImageCounts(**{name: np.asarray(value) for name, value in values.items()})
+
+
+@pytest.mark.parametrize(
+    ("changes", "expected"),
+    [
+        ({"pairs": [0, 5, 5]}, "No pair with it"),
+        (
+            {"accepted": [0, 4, 4]},
+            "None of its 5 pairs was accepted: low inlier ratio (2), too few inliers (3).",
+        ),
+        ({"kept": [0, 3, 3]}, "All its 4 view-graph edges were refused: cycle min (4)."),
+        ({"components": [2, 0, 0]}, "component of 1 images"),
+        ({"rotated": [False, True, True]}, "no rotation"),
+        ({"track_observations": [0, 9, 9]}, "No track"),
+        ({"point_observations": [0, 8, 8]}, "triangulated"),
+        ({}, "Bundle adjustment dropped it"),
+        ({"registered": [True] * 3}, ""),
+    ],
+)
+def test_the_reason_names_the_first_step_that_lost_the_image(changes, expected) -> None:
+    reasons = {"too_few_inliers": 3, "low_inlier_ratio": 2}
+    found = reason_not_registered(0, counts(**changes), "", reasons, {"cycle_min": 4, "component": 0})
+    assert expected in found
+    assert bool(found) == bool(expected)
+
+
+def test_a_duplicate_names_the_image_that_stands_for_it() -> None:
+    assert "a.jpg" in reason_not_registered(0, counts(), "a.jpg", {}, {})
+
+
+def test_observation_errors_are_those_of_the_noise() -> None:
+    problem = make_problem(camera_count=8, point_count=400, noise_px=0.5)
+    points = np.repeat(problem.points, np.diff(problem.track_offsets), axis=0)
+    errors = observation_errors(
+        problem.cameras,
+        problem.camera_ids,
+        problem.rotations,
+        problem.translations,
+        points,
+        problem.track_image_ids,
+        problem.track_keypoints,
+    )
+    # the length of a 2D Gaussian of 0.5 px has mean 0.5 sqrt(pi / 2)
+    assert 0.6 < errors.mean() < 0.65
+    means = mean_by_image(errors, problem.track_image_ids, 9)
+    assert np.isnan(means[8])
+    assert np.all((means[:8] > 0.4) & (means[:8] < 0.9))
+
+
+def test_points_behind_a_camera_have_no_error() -> None:
+    camera = Camera("PINHOLE", 10, 10, (10.0, 10.0, 5.0, 5.0))
+    errors = observation_errors(
+        [camera],
+        np.zeros(1, int),
+        np.eye(3)[None],
+        np.zeros((1, 3)),
+        np.array([[0.0, 0.0, -1.0], [0.0, 0.0, 1.0]]),
+        np.zeros(2, int),
+        np.array([[5.0, 5.0], [5.0, 6.0]]),
+    )
+    assert np.isnan(errors[0])
+    assert errors[1] == pytest.approx(1.0)
+
+
+def test_labels_beyond_the_known_ones_are_still_counted() -> None:
+    assert label_counts(np.array([0, 0, 9]), ("kept", "cycle")) == [("kept", 2), ("label 9", 1)]
+
+
+def test_image_rows_show_errors_against_the_reference_and_the_fewest_observations() -> None:
+    names = ["a", "b", "c"]
+    rows, note = image_rows(names, counts(), {"c": {"rotation_error_deg": 0.1, "position_error": None}}, 2)
+    assert [row[0] for row in rows] == ["a", "c"]
+    assert rows[0][-3:] == [None, None, None]
+    assert rows[1][-2:] == [0.1, None]
+    assert "of 3" in note
+    assert image_rows(names, counts(), {}, 3)[1] == ""
+
+
+def test_metrics_are_grouped_by_threshold_and_statistic_without_texts() -> None:
+    metrics = {
+        "scene": "x",
+        "points": 3,
+        "none": None,
+        "per_image": {},
+        "pose_auc_10deg": 90.0,
+        "pose_auc_2.5deg": 80.0,
+        "relative_pose_auc_3deg": 70.0,
+        "position_error_p90": 0.5,
+        "position_error_median": 0.25,
+    }
+    areas, errors, others = metric_tables(metrics)
+    assert areas[1] == ["poses", "@2.5 deg", "@3 deg", "@10 deg"]
+    assert areas[2] == [["pose AUC", 80.0, None, 90.0], ["relative pose AUC", None, 70.0, None]]
+    assert errors[2] == [["position error", 0.25, None, 0.5, None]]
+    assert others[2] == [["points", 3]]
+
+
+def test_stage_times_sum_the_jobs_of_a_stage_and_bear_missing_values() -> None:
+    head = "s\th:m:s\tmax_rss\n"
+    tables = {
+        Path("b/match_pairs/0-0.tsv"): head + "2.5\t0:00:02\t100\n",
+        Path("b/match_pairs/0-1.tsv"): head + "1.5\t0:00:01\t300\n",
+        Path("b/index_images/job.tsv"): head + "0.5\t0:00:00\tNA\n",
+    }
+    assert stage_times(tables) == {"match_pairs": (4.0, 300.0), "index_images": (0.5, 0.0)}
+
+
+def test_histogram_has_all_errors_and_bears_none() -> None:
+    errors = np.abs(np.random.default_rng(0).normal(size=1000))
+    bars = re.findall(r"px: (\d+)</title>", error_histogram(errors))
+    assert sum(map(int, bars)) == 1000
+    assert error_histogram(np.full(3, np.nan)) == ""
+    assert "<svg" in error_histogram(np.zeros(4))
+
+
+def test_up_is_that_of_the_cameras_in_any_world() -> None:
+    angles = np.linspace(0, 2 * np.pi, 12, endpoint=False)
+    centers = np.column_stack([5 * np.cos(angles), 5 * np.sin(angles), np.ones(12)])
+    rotations = look_at(centers, np.zeros((12, 3)), np.array([0.0, 0.0, 1.0]))
+    turn = exp_so3(np.array([0.5, -1.0, 2.0]))
+    turned, moved = rotations @ turn.T, centers @ turn.T
+    axes = view_axes(turned, translation_of(turned, moved))
+    assert axes[2] == pytest.approx(turn @ [0.0, 0.0, 1.0], abs=1e-6)
+    assert axes @ axes.T == pytest.approx(np.eye(3), abs=1e-9)
+    assert np.linalg.det(axes) == pytest.approx(1.0)
+
+
+def test_up_of_cameras_that_look_down_from_all_sides_is_against_their_view() -> None:
+    rng = np.random.default_rng(0)
+    down = np.array([[1.0, 0, 0], [0, -1, 0], [0, 0, -1]])
+    rotations = np.array([exp_so3(np.array([0, 0, a])) @ down for a in np.linspace(0, 2 * np.pi, 9)[:-1]])
+    centers = np.column_stack([rng.uniform(-9, 9, (8, 2)), 20 + rng.normal(0, 0.01, 8)])
+    axes = view_axes(rotations, translation_of(rotations, centers))
+    assert axes[2] == pytest.approx([0.0, 0.0, 1.0], abs=0.01)
+
+
+@pytest.mark.parametrize("count", [1, 2, 9])
+def test_the_map_shows_cameras_and_points(count) -> None:
+    problem = make_problem(camera_count=9, point_count=300)
+    rotations, translations = problem.rotations[:count], problem.translations[:count]
+    names = [f"<{k}>" for k in range(count)]
+    colors = np.full(problem.points.shape, (250, 10, 20), np.uint8)
+    svg = scene_map(
+        names, rotations, translations, problem.points, colors, view_axes(rotations, translations)
+    )
+    assert svg.count("<path") == count
+    assert "&lt;0&gt;" in svg
+    data = re.search(r"base64,([^\"]+)", svg)
+    assert data is not None
+    picture = cv2.imdecode(np.frombuffer(base64.b64decode(data[1]), np.uint8), cv2.IMREAD_UNCHANGED)
+    shown = picture[picture[..., 3] > 0]
+    assert len(shown) > 300
+    assert shown[0].tolist() == [20, 10, 250, 255]
+
+
+def test_the_map_of_a_model_without_points_has_its_cameras() -> None:
+    problem = make_problem(camera_count=5, point_count=100)
+    axes = view_axes(problem.rotations, problem.translations)
+    nothing = np.zeros((0, 3))
+    svg = scene_map(
+        list("abcde"), problem.rotations, problem.translations, nothing, nothing.astype(np.uint8), axes
+    )
+    assert svg.count("<path") == 5

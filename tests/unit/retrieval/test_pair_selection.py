@@ -1,0 +1,133 @@
+"""Orders, lists, similar images and the options of select_pairs."""
+
+import numpy as np
+import pytest
+
+from snakesfm.config.select_pairs import SelectPairsOptions
+from snakesfm.errors import ConfigError
+from snakesfm.retrieval.listed import listed_pairs
+from snakesfm.retrieval.pairs import PairTable, natural_key, sequential_pairs, similar_pairs
+
+
+def test_natural_order_counts():
+    names = [
+        "img10.jpg",
+        "img2.jpg",
+        "IMG1.JPG",
+        "a/img3.jpg",
+        "img2b.jpg",
+        "img02.jpg",
+        "x²٣.png",
+        "7.png",
+    ]
+    assert sorted(names, key=natural_key) == [
+        "7.png",
+        "a/img3.jpg",
+        "IMG1.JPG",
+        "img02.jpg",
+        "img2.jpg",
+        "img2b.jpg",
+        "img10.jpg",
+        "x²٣.png",
+    ]
+
+
+def test_sequence_follows_the_natural_order_of_names():
+    names = sorted(f"img{k}.jpg" for k in range(1, 13))
+    table = sequential_pairs(names, 2)
+    steps = {abs(int(names[i][3:-4]) - int(names[j][3:-4])) for i, j in table.pairs}
+    assert steps == {1, 2}
+    assert len(table.pairs) == 11 + 10
+
+
+def unit_vectors(count, seed=0):
+    vectors = np.random.default_rng(seed).normal(size=(count, 32)) + 0.3
+    vectors /= np.linalg.norm(vectors, axis=1, keepdims=True)
+    return (np.rint(vectors * 2048) / 2048).astype(np.float32)
+
+
+@pytest.mark.parametrize("block_count", [1, 2, 7, 50])
+def test_similar_pairs_do_not_depend_on_the_blocks(block_count):
+    vectors = unit_vectors(50)
+    vectors[7] = vectors[3]
+    dealt = np.random.default_rng(block_count).integers(0, block_count, 50)
+    blocks = [np.flatnonzero(dealt == block) for block in range(block_count)]
+    table = similar_pairs(blocks, lambda block: vectors[blocks[block]], 4, 0.1)
+    similarity = vectors @ vectors.T
+    np.fill_diagonal(similarity, -1)
+    expected = {
+        tuple(sorted((i, int(j))))
+        for i in range(50)
+        for j in np.argsort(-similarity[i], kind="stable")[:4]
+        if similarity[i, j] >= 0.1
+    }
+    assert {tuple(pair) for pair in table.pairs} == expected
+    np.testing.assert_array_equal(table.similarities, similarity[tuple(table.pairs.T)])
+
+
+def test_images_without_features_resemble_none():
+    vectors = unit_vectors(6)
+    vectors[2] = 0
+    table = similar_pairs([np.arange(6)], lambda block: vectors, 5, -1.0)
+    assert 2 not in table.pairs
+
+
+def test_union_joins_reasons_and_keeps_similarities():
+    first = PairTable.of(np.array([[0, 1], [1, 2]]), "sequential")
+    second = PairTable.of(np.array([[2, 1], [0, 3]]), "retrieved", np.array([0.5, 0.25], np.float32))
+    table = first.union(second)
+    assert table.pairs.tolist() == [[0, 1], [0, 3], [1, 2]]
+    assert table.reason_texts() == ["sequential", "retrieved", "sequential+retrieved"]
+    np.testing.assert_array_equal(table.similarities, np.array([np.nan, 0.25, 0.5], np.float32))
+
+
+def test_listed_names_may_hold_spaces():
+    names = ["a", "a b", "b c.jpg", "c.jpg", "ü/#{x} 1.JPG", "# d"]
+    lines = [
+        "# a comment",
+        "",
+        "a b b c.jpg",
+        "a b\tc.jpg",
+        "  ü/#{x} 1.JPG   a\r",
+        "# d a",
+    ]
+    table, skipped = listed_pairs(lines, names, [], "pairs.txt")
+    # 'a b b c.jpg' is 'a b' + 'b c.jpg', for no image is called 'a b b'
+    assert table.pairs.tolist() == [[0, 4], [0, 5], [1, 2], [1, 3]]
+    assert skipped == 0
+
+
+def test_listed_pairs_with_a_refused_image_are_skipped():
+    table, skipped = listed_pairs(["a bad", "a b"], ["a", "b"], ["bad"], "pairs.txt")
+    assert table.pairs.tolist() == [[0, 1]] and skipped == 1
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        ("img1.jpg img22.jpg", ["pairs.txt:2", "'img22.jpg'", "did you mean 'img2.jpg'"]),
+        ("img1.jpg", ["pairs.txt:2", "no pair"]),
+        ("img1.jpg img2.jpg extra", ["pairs.txt:2", "tab"]),
+        ("img1.jpg\tzzz", ["pairs.txt:2", "'zzz'", "relative to the image folder"]),
+    ],
+)
+def test_a_wrong_line_is_named(line, words):
+    with pytest.raises(ConfigError) as error:
+        listed_pairs(["img1.jpg img2.jpg", line], ["img1.jpg", "img2.jpg"], [], "pairs.txt")
+    assert all(word in str(error.value) for word in words), str(error.value)
+
+
+def test_auto_is_resolved_by_the_number_of_images():
+    options = SelectPairsOptions()
+    most = options.exhaustive_up_to
+    assert options.resolve(most).method == "exhaustive"
+    assert options.resolve(most + 1).method == "sequential+retrieval"
+    assert options.resolve(most, "pairs.txt").method == "listed"
+    assert (options.resolve(499).top_k, options.resolve(500).top_k) == (5, 15)
+    assert not options.resolve(2).needs_descriptors
+    assert options.resolve(most + 1).needs_descriptors
+    kept = SelectPairsOptions(method="retrieval", top_k=7).resolve(10)
+    assert (kept.method, kept.top_k) == ("retrieval", 7)
+    assert kept.resolve(1000) == kept
+    with pytest.raises(ValueError, match="resolve"):
+        _ = options.needs_descriptors

@@ -1,0 +1,129 @@
+"""Spanning trees, linear steps, noise models, reseating and rejection on synthetic truth."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from snakesfm.geometry.rotations import angle_of
+from snakesfm.rotation_averaging.base import RotationGraph, edge_residuals
+from snakesfm.rotation_averaging.irls import IrlsAverager
+from snakesfm.rotation_averaging.linear import solve_anisotropic, solve_isotropic
+from snakesfm.rotation_averaging.noise import fit_noise
+from snakesfm.rotation_averaging.rejection import residual_limit
+from snakesfm.rotation_averaging.reseat import reseat_nodes
+from snakesfm.rotation_averaging.tree import tree_rotations
+from snakesfm.rotation_averaging.two_stage import TwoStageAverager
+
+
+def random_graph(node_count, edge_count, seed, node_bias=None):
+    """A connected random graph: pairs, exact rotations, truth."""
+    rng = np.random.default_rng(seed)
+    chain = np.stack([np.arange(node_count - 1), np.arange(1, node_count)], axis=1)
+    more = rng.integers(0, node_count, (edge_count, 2))
+    more = np.sort(more[more[:, 0] != more[:, 1]], axis=1)
+    pairs = np.unique(np.concatenate([chain, more]), axis=0)
+    truth = Rotation.random(node_count, rng).as_matrix()
+    return pairs, truth[pairs[:, 1]] @ truth[pairs[:, 0]].transpose(0, 2, 1), truth
+
+
+def test_residuals_vanish_at_the_truth_and_are_nan_without_a_rotation():
+    pairs, rotations, truth = random_graph(10, 30, 0)
+    assert edge_residuals(pairs, rotations, truth).max() < 1e-7
+    truth[4] = np.nan
+    touched = (pairs == 4).any(axis=1)
+    np.testing.assert_array_equal(np.isnan(edge_residuals(pairs, rotations, truth)), touched)
+
+
+def test_tree_avoids_costly_edges():
+    pairs, rotations, truth = random_graph(30, 80, 1)
+    costs = np.ones(len(pairs))
+    wrong = pairs[:, 1] - pairs[:, 0] > 1
+    costs[wrong] = 50.0
+    rotations[wrong] = np.eye(3)
+    averaged = tree_rotations(30, pairs, rotations, costs)
+    gauge = averaged[0].T @ truth[0]
+    assert angle_of(averaged @ gauge @ truth.transpose(0, 2, 1)).max() < 1e-6
+
+
+@pytest.mark.parametrize("edge_count", [60, 40_000])
+def test_linear_steps_minimise_their_cost(edge_count):
+    # 40,000 edges of 700 nodes are solved iteratively, few ones directly
+    node_count = 20 if edge_count == 60 else 700
+    pairs, _, _ = random_graph(node_count, edge_count, 2)
+    rng = np.random.default_rng(3)
+    residuals = rng.normal(size=(len(pairs), 3))
+    weights = rng.uniform(0.1, 2.0, len(pairs))
+    increments = solve_isotropic(node_count, pairs, weights, residuals)
+    information = weights[:, None, None] * np.eye(3)
+    np.testing.assert_allclose(
+        solve_anisotropic(node_count, pairs, information, residuals), increments, atol=1e-4
+    )
+    np.testing.assert_array_equal(increments[0], 0)
+    forces = weights[:, None] * (increments[pairs[:, 1]] - increments[pairs[:, 0]] - residuals)
+    balance = np.zeros((node_count, 3))
+    np.add.at(balance, pairs[:, 1], forces)
+    np.add.at(balance, pairs[:, 0], -forces)
+    assert np.abs(balance[1:]).max() < 1e-2 * np.abs(forces).max()
+
+
+def test_noise_model_finds_the_scale_of_overconfident_covariances():
+    rng = np.random.default_rng(4)
+    roots = np.radians(rng.uniform(0.1, 1.0, (3000, 1)))
+    residuals = roots * rng.normal(size=(3000, 3))
+    given = roots[..., None] ** 2 * np.eye(3) / 25.0
+    counts = np.tile(np.eye(3), (3000, 1, 1))
+    fitted, _ = fit_noise(residuals, [counts, given])
+    ratios = np.sqrt(fitted[:, 0, 0]) / roots[:, 0]
+    # Student t on normal residuals: the scale is somewhat smaller than the deviation
+    assert 0.6 < np.median(ratios) < 1.1
+    assert ratios.std() < 0.15
+
+
+def test_noise_model_prefers_equal_weights_to_meaningless_covariances():
+    rng = np.random.default_rng(5)
+    residuals = np.radians(0.5) * rng.normal(size=(2000, 3))
+    meaningless = np.exp(rng.normal(0, 2, (2000, 1, 1))) * np.eye(3)
+    fitted, _ = fit_noise(residuals, [meaningless])
+    deviations = np.sqrt(fitted[:, 0, 0])
+    assert np.percentile(deviations, 90) < 1.5 * np.percentile(deviations, 10)
+
+
+def test_noise_model_survives_zero_residuals():
+    fitted, likelihood = fit_noise(np.zeros((5, 3)), [np.tile(np.eye(3), (5, 1, 1))])
+    assert np.isfinite(fitted).all() and np.isfinite(likelihood)
+
+
+def test_reseating_frees_a_stuck_node():
+    pairs, rotations, truth = random_graph(15, 80, 6)
+    graph = RotationGraph(15, pairs, rotations, np.ones(len(pairs)), np.full((len(pairs), 3, 3), np.nan))
+    stuck = truth.copy()
+    stuck[7] = Rotation.from_rotvec([0, 2.0, 0]).as_matrix() @ stuck[7]
+    assert angle_of(reseat_nodes(graph, stuck, 0.1) @ truth.transpose(0, 2, 1)).max() < 1e-6
+    np.testing.assert_array_equal(reseat_nodes(graph, truth, 0.1), truth)
+
+
+@pytest.mark.parametrize(
+    ("residuals", "expected"), [([0.1, 0.1, np.nan], 5.0), ([9.0, 9.0, 9.0], 10.0), ([2.0, 2.0], 6.5)]
+)
+def test_limit_adapts_within_bounds(residuals, expected):
+    assert residual_limit(np.array(residuals), 5.0, 10.0) == pytest.approx(expected, abs=0.01)
+
+
+def test_confident_outliers_do_not_spoil_the_gain_of_covariances():
+    pairs, rotations, truth = random_graph(80, 400, 9)
+    rng = np.random.default_rng(10)
+    roots = np.radians(2.0) * np.exp(rng.normal(0, 1.2, len(pairs)))
+    noise = Rotation.from_rotvec(roots[:, None] * rng.normal(size=(len(pairs), 3))).as_matrix()
+    rotations = noise @ rotations
+    wrong = rng.uniform(size=len(pairs)) < 0.1
+    rotations[wrong] = Rotation.random(int(wrong.sum()), rng).as_matrix()
+    # outliers are as confident as they can be, and all are over-confident
+    roots[wrong] = roots.min()
+    covariances = (roots[:, None, None] / 3.0) ** 2 * np.eye(3)
+    errors = {}
+    for averager in (IrlsAverager(), TwoStageAverager()):
+        averaged = averager.average(80, pairs, rotations, None, covariances)
+        gauge = averaged.transpose(0, 2, 1) @ truth
+        mean = Rotation.from_matrix(gauge).mean().as_matrix()
+        errors[type(averager)] = np.degrees(angle_of(gauge @ mean.T)).mean()
+    assert 0.05 < errors[TwoStageAverager] < 0.75 * errors[IrlsAverager]

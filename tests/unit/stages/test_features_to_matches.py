@@ -1,0 +1,351 @@
+"""From images to matches by the stages themselves, on rendered images."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from snakesfm.artifacts import (
+    GlobalDescriptors,
+    Header,
+    ImageIndex,
+    ImagePairs,
+    LocalFeatures,
+    PairMatches,
+    Vocabulary,
+)
+from snakesfm.config.describe_images import DescribeImagesOptions
+from snakesfm.config.extract_features import ExtractFeaturesOptions
+from snakesfm.config.learn_vocabulary import LearnVocabularyOptions
+from snakesfm.config.match_pairs import MatchPairsOptions
+from snakesfm.config.select_pairs import SelectPairsOptions
+from snakesfm.errors import ConfigError
+from snakesfm.seeding import block_of
+from snakesfm.stages import describe_images, extract_features, learn_vocabulary, match_pairs, select_pairs
+from snakesfm.stages.job import StageJob
+
+NAMES = ["a/1 #{x}.png", "b/ü 2.png", "flat.png", "gone.png", "other.png", "shifted.png"]
+SHIFT = (23, 7)
+
+
+def texture(seed, height=240, width=320):
+    rng = np.random.default_rng(seed)
+    image = cv2.resize(rng.uniform(0, 255, (30, 40)), (width, height), interpolation=cv2.INTER_CUBIC)
+    for _ in range(160):
+        x, y = int(rng.integers(width)), int(rng.integers(height))
+        size = int(rng.integers(3, 15))
+        cv2.rectangle(image, (x, y), (x + size, y + size), float(rng.uniform(0, 255)), -1)
+    return np.clip(cv2.GaussianBlur(image, (0, 0), 1.2), 0, 255).astype(np.uint8)
+
+
+@pytest.fixture(scope="module")
+def images(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("images")
+    wide = texture(1, 260, 360)
+    pictures = {
+        "a/1 #{x}.png": wide[:240, :320],
+        "b/ü 2.png": wide[SHIFT[1] : 240 + SHIFT[1], SHIFT[0] : 320 + SHIFT[0]],
+        "flat.png": np.full((240, 320), 128, np.uint8),
+        "other.png": texture(2),
+        "shifted.png": wide[4:244, 12:332],
+    }
+    noise = np.random.default_rng(5)
+    for name, picture in pictures.items():
+        path = folder / name
+        if name != "flat.png":
+            picture = np.clip(picture + noise.normal(scale=2, size=picture.shape), 0, 255).astype(np.uint8)
+        path.parent.mkdir(exist_ok=True)
+        path.write_bytes(cv2.imencode(".png", picture)[1].tobytes())
+    (folder / "gone.png").write_bytes(b"\x89PNG no image")
+    return folder
+
+
+class Scene:
+    """The stages from index to matches, in one folder, with a number of blocks."""
+
+    def __init__(self, folder, images, blocks, shas=None):
+        self.folder, self.images, self.blocks = folder, images, blocks
+        count = len(NAMES)
+        index = ImageIndex(
+            names=NAMES,
+            sizes=np.tile([320, 240], (count, 1)),
+            sha256=shas or [f"sha of {name}" for name in NAMES],
+            blocks=[block_of(name, blocks) for name in NAMES],
+            camera_ids=np.zeros(count, int),
+            orientations=np.ones(count, int),
+            focal_exif_px=np.full(count, np.nan),
+            gps=np.full((count, 3), np.nan),
+            duplicate_of=np.full(count, -1),
+            camera_models=["PINHOLE"],
+            camera_sizes=[[320, 240]],
+            camera_params=np.full((1, 12), np.nan),
+            camera_sources=["given"],
+            refused_names=["bad.jpg"],
+            refused_reasons=["bad.jpg is cut off."],
+        )
+        index.write(self.file("index"), Header("index_images", 1, "scene"))
+
+    def file(self, name):
+        return self.folder / f"{name}.h5"
+
+    def job(self, stage, options, inputs, outputs, former=None, **settings):
+        return StageJob(
+            stage=stage,
+            scene="scene",
+            inputs=inputs,
+            outputs=tuple(outputs),
+            options=options,
+            settings=settings,
+            former=former,
+        )
+
+    def block_files(self, stage):
+        return [self.file(f"{stage}/{block}") for block in range(self.blocks)]
+
+    def tile_files(self, stage):
+        return [self.file(f"{stage}/{a}-{b}") for a in range(self.blocks) for b in range(a, self.blocks)]
+
+    def extract(self, options=None, former=None):
+        for block, output in enumerate(self.block_files("features")):
+            inputs = {"index": self.file("index")}
+            extract_features.run(
+                self.job(
+                    "extract_features",
+                    options or ExtractFeaturesOptions(max_keypoints=400),
+                    inputs,
+                    [output],
+                    former and former.block_files("features")[block],
+                    images=str(self.images),
+                    block=block,
+                )
+            )
+
+    def describe(self):
+        features = self.block_files("features")
+        vocabulary = self.file("vocabulary")
+        learn_vocabulary.run(
+            self.job(
+                "learn_vocabulary", LearnVocabularyOptions(words=8), {"features": features}, [vocabulary]
+            )
+        )
+        for path, output in zip(features, self.block_files("descriptors"), strict=True):
+            inputs = {"features": path, "vocabulary": vocabulary}
+            describe_images.run(self.job("describe_images", DescribeImagesOptions(), inputs, [output]))
+
+    def select(self, options, pairs_file=""):
+        descriptors = self.block_files("descriptors") if "retrieval" in options.method else []
+        inputs = {"index": self.file("index"), "descriptors": descriptors}
+        select_pairs.run(
+            self.job(
+                "select_pairs",
+                options,
+                inputs,
+                self.tile_files("pairs"),
+                blocks=self.blocks,
+                pairs_file=pairs_file,
+            )
+        )
+        rows = []
+        for path in self.tile_files("pairs"):
+            part = ImagePairs.read(path)
+            rows += list(zip(map(tuple, part.pairs), part.reasons, part.similarities, strict=True))
+        return sorted(rows, key=lambda row: row[0])
+
+    def match(self, options=None, former=None):
+        for tile, output in enumerate(self.tile_files("matches")):
+            blocks = sorted({int(part) for part in output.stem.split("-")})
+            inputs = {
+                "pairs": self.tile_files("pairs")[tile],
+                "features": [self.block_files("features")[block] for block in blocks],
+            }
+            match_pairs.run(
+                self.job(
+                    "match_pairs",
+                    options or MatchPairsOptions(),
+                    inputs,
+                    [output],
+                    former and former.tile_files("matches")[tile],
+                )
+            )
+        found = {}
+        for path in self.tile_files("matches"):
+            part = PairMatches.read(path)
+            for row, pair in enumerate(part.pairs):
+                rows = slice(part.offsets[row], part.offsets[row + 1])
+                found[tuple(pair.tolist())] = (part.matches[rows], part.scores[rows], part.digests[row])
+        return found
+
+    def features(self):
+        found = {}
+        for path in self.block_files("features"):
+            part = LocalFeatures.read(path)
+            for row, name in enumerate(part.names):
+                rows = slice(part.offsets[row], part.offsets[row + 1])
+                found[name] = {
+                    column: getattr(part, column)[rows]
+                    for column in ("keypoints", "descriptors", "scores", "scales", "angles", "colors")
+                }
+        return found
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory, images):
+    scene = Scene(tmp_path_factory.mktemp("whole"), images, 1)
+    scene.extract()
+    scene.describe()
+    return scene
+
+
+@pytest.fixture(scope="module")
+def dealt(tmp_path_factory, images):
+    scene = Scene(tmp_path_factory.mktemp("dealt"), images, 3)
+    scene.extract()
+    scene.describe()
+    return scene
+
+
+def test_features_do_not_depend_on_the_blocks(whole, dealt):
+    one, many = whole.features(), dealt.features()
+    assert sorted(one) == sorted(many) == sorted(NAMES)
+    for name in NAMES:
+        for column, values in one[name].items():
+            np.testing.assert_array_equal(values, many[name][column])
+    counts = [len(one[name]["keypoints"]) for name in NAMES]
+    assert counts[2] == counts[3] == 0 and min(counts[0], counts[1], counts[4], counts[5]) > 100
+
+
+def test_one_bad_image_is_a_warning(images, tmp_path, capsys):
+    Scene(tmp_path, images, 1).extract()
+    lines = capsys.readouterr().out.splitlines()
+    warnings = [line for line in lines if line.startswith("warning")]
+    assert len(warnings) == 1 and "gone.png" in warnings[0]
+    assert lines[-1].startswith("6 images (0 taken over)")
+
+
+def test_colors_are_those_of_the_image(whole, images):
+    found = whole.features()["other.png"]
+    picture = cv2.imread(str(images / "other.png"))
+    columns, rows = np.floor(found["keypoints"]).astype(int).T
+    np.testing.assert_array_equal(found["colors"], picture[rows, columns])
+
+
+def test_vocabulary_and_pairs_do_not_depend_on_the_blocks(whole, dealt):
+    np.testing.assert_array_equal(
+        Vocabulary.read(whole.file("vocabulary")).centers, Vocabulary.read(dealt.file("vocabulary")).centers
+    )
+    options = SelectPairsOptions(method="sequential+retrieval", look_ahead=1, top_k=2)
+    assert str(whole.select(options)) == str(dealt.select(options))
+
+
+def test_retrieval_prefers_what_overlaps(dealt):
+    rows = dealt.select(SelectPairsOptions(method="retrieval", top_k=1, min_score=0.0))
+    pairs = {pair for pair, _, _ in rows}
+    assert pairs & {(0, 1), (0, 5), (1, 5)}
+    assert not any(2 in pair or 3 in pair for pair in pairs)
+    assert all(0 < similarity <= 1.001 for _, _, similarity in rows)
+    vectors = GlobalDescriptors.read(dealt.block_files("descriptors")[0]).descriptors
+    assert vectors.shape[1] == 8 * 128
+
+
+def test_auto_takes_all_pairs_of_few_images(dealt):
+    rows = dealt.select(SelectPairsOptions())
+    assert [pair for pair, _, _ in rows] == [(i, j) for i in range(6) for j in range(i + 1, 6)]
+    assert {reason for _, reason, _ in rows} == {"exhaustive"}
+
+
+def test_a_list_is_followed(dealt, tmp_path):
+    path = tmp_path / "my pairs.txt"
+    path.write_text("\ufeffb/ü 2.png a/1 #{x}.png\nother.png bad.jpg\n", "utf-8")
+    rows = dealt.select(SelectPairsOptions(), str(path))
+    assert [(pair, reason) for pair, reason, _ in rows] == [((0, 1), "listed")]
+    path.write_text("b/ü 2.png nobody.png\n", "utf-8")
+    with pytest.raises(ConfigError, match=r"my pairs.txt:1.*nobody"):
+        dealt.select(SelectPairsOptions(), str(path))
+    with pytest.raises(ConfigError, match="pairs=FILE"):
+        dealt.select(SelectPairsOptions(method="listed"))
+    with pytest.raises(ConfigError, match="cannot be read"):
+        dealt.select(SelectPairsOptions(method="listed"), str(tmp_path / "missing.txt"))
+
+
+def test_matches_are_right_and_do_not_depend_on_the_blocks(whole, dealt):
+    whole.select(SelectPairsOptions())
+    dealt.select(SelectPairsOptions())
+    one, many = whole.match(), dealt.match()
+    assert one.keys() == many.keys()
+    for pair in one:
+        np.testing.assert_array_equal(one[pair][0], many[pair][0])
+        assert one[pair][2] == many[pair][2]
+    points = whole.features()
+    matches, scores, _ = one[0, 1]
+    offset = points[NAMES[0]]["keypoints"][matches[:, 0]] - points[NAMES[1]]["keypoints"][matches[:, 1]]
+    error = np.linalg.norm(offset - SHIFT, axis=1)
+    assert len(matches) > 80 and (error < 1).mean() > 0.97 and 1e-4 < np.median(error) < 0.1
+    assert ((scores >= 0.2 - 1e-6) & (scores <= 1)).all()
+    assert len(one[0, 4][0]) < 12 and len(one[0, 2][0]) == len(one[2, 3][0]) == 0
+
+
+def test_unchanged_images_and_pairs_are_taken_over(dealt, images, tmp_path, monkeypatch, capsys):
+    dealt.select(SelectPairsOptions())
+    before = dealt.match()
+    shas = [f"sha of {name}" for name in NAMES]
+    shas[4] = "another"
+    scene = Scene(tmp_path, images, 3, shas)
+    scene.select(SelectPairsOptions())
+    read = []
+    original = extract_features.read_image
+    monkeypatch.setattr(
+        extract_features, "read_image", lambda path, side: read.append(path) or original(path, side)
+    )
+    scene.extract(former=dealt)
+    assert [Path(path).name for path in read] == ["other.png"]
+    capsys.readouterr()
+    after = scene.match(former=dealt)
+    lines = capsys.readouterr().out.splitlines()
+    assert sum(int(line.split("(")[1].split()[0]) for line in lines) == 10
+    for pair in before:
+        np.testing.assert_array_equal(before[pair][0], after[pair][0])
+        np.testing.assert_array_equal(before[pair][1], after[pair][1])
+        assert (before[pair][2] == after[pair][2]) == (4 not in pair)
+
+
+def test_other_options_or_a_damaged_former_file_take_nothing_over(dealt, images, tmp_path, capsys):
+    scene = Scene(tmp_path, images, 3)
+    scene.extract(ExtractFeaturesOptions(max_keypoints=100), former=dealt)
+    assert "(0 taken over)" in capsys.readouterr().out
+    for path in scene.block_files("features"):
+        path.write_bytes(b"damaged")
+    other = Scene(tmp_path / "again", images, 3)
+    other.extract(former=scene)
+    assert all(len(points["keypoints"]) <= 400 for points in other.features().values())
+
+
+def test_an_empty_scene_gives_valid_files(tmp_path, images):
+    scene = Scene(tmp_path, images, 40)
+    empty = next(block for block in range(40) if block not in {block_of(name, 40) for name in NAMES})
+    inputs = {"index": scene.file("index")}
+    output = scene.block_files("features")[empty]
+    extract_features.run(
+        scene.job(
+            "extract_features",
+            ExtractFeaturesOptions(),
+            inputs,
+            [output],
+            images=str(images),
+            block=empty,
+        )
+    )
+    assert LocalFeatures.read(output).descriptors.shape == (0, 128)
+    scene.job("learn_vocabulary", LearnVocabularyOptions(), {"features": [output]}, [scene.file("v")])
+    learn_vocabulary.run(
+        scene.job("learn_vocabulary", LearnVocabularyOptions(), {"features": [output]}, [scene.file("v")])
+    )
+    describe_images.run(
+        scene.job(
+            "describe_images",
+            DescribeImagesOptions(),
+            {"features": output, "vocabulary": scene.file("v")},
+            [scene.file("d")],
+        )
+    )
+    assert len(GlobalDescriptors.read(scene.file("d")).image_ids) == 0

@@ -1,0 +1,139 @@
+"""Tracks from matches: components, splitting and observations."""
+
+import numpy as np
+import pytest
+
+from snakesfm.synthetic.problems import make_problem
+from snakesfm.tracks.build import build_tracks
+from snakesfm.tracks.canonical import canonical_keypoints
+from snakesfm.tracks.split import cycle_support, split_conflicts
+
+
+def spread_keypoints(images, count):
+    grid = np.stack([np.arange(count) * 10.0, np.arange(count) * 7.0], axis=1).astype(np.float32)
+    return [grid + image for image in range(images)]
+
+
+def matches_of(table):
+    pairs = sorted(table)
+    offsets = np.r_[0, np.cumsum([len(table[p]) for p in pairs])].astype(np.int64)
+    flat = np.array([m for p in pairs for m in table[p]], dtype=np.int32).reshape(-1, 2)
+    return np.array(pairs, dtype=np.int32).reshape(-1, 2), offsets, flat
+
+
+def as_sets(tracks):
+    rows = list(zip(tracks.image_ids.tolist(), tracks.keypoint_ids.tolist(), strict=True))
+    return [rows[a:b] for a, b in zip(tracks.offsets[:-1], tracks.offsets[1:], strict=True)]
+
+
+def test_chains_become_tracks_sorted_by_first_observation():
+    table = {(0, 1): [(5, 1), (2, 2)], (1, 2): [(1, 4), (2, 0)], (0, 2): [(2, 0)]}
+    tracks = build_tracks(spread_keypoints(3, 6), *matches_of(table))
+    assert as_sets(tracks) == [[(0, 2), (1, 2), (2, 0)], [(0, 5), (1, 1), (2, 4)]]
+    assert tracks.conflicts == 0
+    assert tracks.offsets.dtype == np.int64 and tracks.image_ids.dtype == np.int32
+
+
+def test_short_tracks_are_left_out():
+    table = {(0, 1): [(0, 0), (1, 1)], (1, 2): [(0, 0)]}
+    assert len(as_sets(build_tracks(spread_keypoints(3, 3), *matches_of(table), min_length=3))) == 1
+    assert len(as_sets(build_tracks(spread_keypoints(3, 3), *matches_of(table), min_length=2))) == 2
+
+
+def test_no_matches_give_no_tracks():
+    tracks = build_tracks(spread_keypoints(2, 3), *matches_of({}))
+    assert tracks.offsets.tolist() == [0] and len(tracks.image_ids) == 0
+    assert build_tracks([], *matches_of({})).offsets.tolist() == [0]
+
+
+def two_tracks_with_a_wrong_link():
+    """Two points seen by images 0..3, all pairs matched, and one wrong match between the two."""
+    pairs = [(i, j) for i in range(4) for j in range(i + 1, 4)]
+    table = {pair: [(0, 0), (1, 1)] for pair in pairs}
+    table[1, 2] = [*table[1, 2], (0, 1)]
+    return table
+
+
+def test_conflict_is_cut_at_the_unconfirmed_match():
+    tracks = build_tracks(spread_keypoints(4, 2), *matches_of(two_tracks_with_a_wrong_link()))
+    assert tracks.conflicts == 1
+    assert as_sets(tracks) == [[(i, 0) for i in range(4)], [(i, 1) for i in range(4)]]
+
+
+def test_conflict_is_dropped_whole_where_splitting_is_off():
+    tracks = build_tracks(
+        spread_keypoints(4, 2), *matches_of(two_tracks_with_a_wrong_link()), split=False
+    )
+    assert as_sets(tracks) == [] and tracks.conflicts == 1
+
+
+def test_pair_with_fewer_matches_is_cut_where_no_cycle_decides():
+    keypoints = spread_keypoints(4, 12)
+    table = {(0, 1): [(0, 0), *((k, k) for k in range(2, 9))], (1, 2): [(0, 0), (9, 9)], (0, 2): [(1, 0)]}
+    tracks = build_tracks(keypoints, *matches_of(table), min_length=2)
+    assert [(0, 0), (1, 0), (2, 0)] in as_sets(tracks)
+    assert not any((0, 1) in track for track in as_sets(tracks))
+
+
+def test_near_keypoints_of_one_image_are_one_observation():
+    keypoints = spread_keypoints(3, 3)
+    keypoints[1][1] = keypoints[1][0] + np.float32(0.5)
+    table = {(0, 1): [(0, 0)], (1, 2): [(1, 0)], (0, 2): [(0, 0)]}
+    joined = build_tracks(keypoints, *matches_of(table), merge_radius_px=1.0)
+    assert as_sets(joined) == [[(0, 0), (1, 0), (2, 0)]]
+    assert as_sets(build_tracks(keypoints, *matches_of(table), merge_radius_px=0.1)) != [
+        [(0, 0), (1, 1), (2, 0)]
+    ]
+
+
+def test_keypoints_at_one_place_are_one_node():
+    keypoints = spread_keypoints(3, 3)
+    keypoints[1][2] = keypoints[1][0]
+    table = {(0, 1): [(0, 0)], (1, 2): [(2, 0)]}
+    assert as_sets(build_tracks(keypoints, *matches_of(table))) == [[(0, 0), (1, 0), (2, 0)]]
+    np.testing.assert_array_equal(canonical_keypoints(keypoints[1]), [0, 1, 0])
+    assert len(canonical_keypoints(np.zeros((0, 2), np.float32))) == 0
+
+
+def test_cycle_support_counts_triangles():
+    links = np.array([(0, 1), (1, 2), (0, 2), (2, 3)])
+    np.testing.assert_array_equal(cycle_support(links, 4), [1, 1, 1, 0])
+
+
+def test_splitting_does_not_depend_on_the_order_of_links():
+    rng = np.random.default_rng(3)
+    links = np.unique(np.sort(rng.integers(0, 40, (120, 2)), axis=1), axis=0)
+    links = links[links[:, 0] != links[:, 1]]
+    strengths, images = rng.integers(0, 3, len(links)), np.arange(40) % 8
+    places = rng.uniform(0, 500, (40, 2))
+    labels = split_conflicts(links, strengths, images, places, 1.0)
+    order = rng.permutation(len(links))
+    np.testing.assert_array_equal(
+        labels, split_conflicts(links[order], strengths[order], images, places, 1.0)
+    )
+    for label in np.unique(labels):
+        inside = images[labels == label]
+        assert len(np.unique(inside)) == len(inside)
+
+
+@pytest.mark.parametrize("outlier_ratio", [0.0, 0.05])
+def test_synthetic_scene_gives_true_tracks(outlier_ratio):
+    problem = make_problem(15, 600, outlier_ratio=outlier_ratio, seed=2)
+    build = {
+        split: build_tracks(
+            list(problem.keypoints), problem.pairs, problem.match_offsets, problem.matches, split=split
+        )
+        for split in (True, False)
+    }
+    tracks = build[True]
+    shown = np.concatenate(problem.keypoint_points)
+    base = np.r_[0, np.cumsum([len(k) for k in problem.keypoints])]
+    points = shown[base[tracks.image_ids] + tracks.keypoint_ids]
+    pure = [len(np.unique(points[a:b])) == 1 for a, b in zip(tracks.offsets, tracks.offsets[1:], strict=False)]
+    for a, b in zip(tracks.offsets[:-1], tracks.offsets[1:], strict=True):
+        assert np.all(np.diff(tracks.image_ids[a:b]) > 0)
+    if outlier_ratio == 0:
+        assert all(pure) and tracks.conflicts == 0
+    else:
+        assert 0.5 < np.mean(pure) < 1.0
+        assert len(tracks.offsets) > 1.1 * len(build[False].offsets)

@@ -1,0 +1,226 @@
+import dataclasses
+
+import numpy as np
+import pytest
+
+from snakesfm.geometry.rotations import angle_between
+from snakesfm.synthetic.problems import make_problem, perturb_rotations
+from snakesfm.translation_averaging.angular import refine_angles
+from snakesfm.translation_averaging.average import average_translations, normalize_gauge
+from snakesfm.translation_averaging.averagers import ScaleChain, edge_angles_rad, with_rays
+from snakesfm.translation_averaging.landmarks import cover_cameras, intersect
+from snakesfm.translation_averaging.problem import PositioningProblem, edge_directions, world_rays
+from snakesfm.translation_averaging.recovery import mfas_weights
+from snakesfm.translation_averaging.scale_chain import refine_directions, shared_rays
+from snakesfm.translation_averaging.support import SupportLimits
+
+LIMITS = SupportLimits()
+
+
+def positioning(truth, rotations=None):
+    rotations = truth.rotations if rotations is None else rotations
+    lengths = np.diff(truth.track_offsets)
+    images = truth.track_image_ids.astype(np.int64)
+    return PositioningProblem(
+        truth.image_count,
+        truth.pairs.astype(np.int64),
+        edge_directions(rotations, truth.pairs, truth.edge_translations),
+        np.sqrt(truth.edge_covariances[:, 3, 3]),
+        images,
+        np.repeat(np.arange(len(lengths)), lengths),
+        world_rays(rotations, images, truth.cameras[0].normalize(truth.track_keypoints)),
+    )
+
+
+def errors(centers, truth):
+    known = np.isfinite(centers[:, 0])
+    a = centers[known] - np.median(centers[known], axis=0)
+    b = truth[known] - np.median(truth[known], axis=0)
+    scale = np.sum(a * b) / np.sum(a * a)
+    return np.linalg.norm(scale * a - b - np.median(scale * a - b, axis=0), axis=1)
+
+
+def test_directions_point_from_camera_i_to_camera_j():
+    truth = make_problem(10, 500, "area", rotation_noise_deg=0.0)
+    directions = edge_directions(truth.rotations, truth.pairs, truth.edge_translations)
+    baselines = truth.centers[truth.pairs[:, 1]] - truth.centers[truth.pairs[:, 0]]
+    assert angle_between(directions, baselines).max() < 1e-7
+
+
+def test_rays_point_at_the_points():
+    truth = make_problem(10, 300, "ring", noise_px=0.0)
+    problem = positioning(truth)
+    offsets = truth.points[problem.ray_tracks] - truth.centers[problem.ray_images]
+    assert angle_between(offsets, problem.rays).max() < 1e-5
+
+
+def test_cover_gives_each_camera_its_rays_with_whole_tracks():
+    truth = make_problem(30, 2000, "street")
+    problem = positioning(truth)
+    mask = cover_cameras(problem.ray_images, problem.ray_tracks, 30, 20)
+    available = np.bincount(problem.ray_images, minlength=30)
+    assert np.all(np.bincount(problem.ray_images[mask], minlength=30) >= np.minimum(available, 20))
+    assert 0 < mask.sum() < len(mask)
+    for track in np.unique(problem.ray_tracks[mask])[:20]:
+        assert mask[problem.ray_tracks == track].all()
+
+
+def test_intersect_ignores_a_wrong_line_and_flags_parallel_ones():
+    rng = np.random.default_rng(0)
+    target = np.array([0.3, -0.2, 5.0])
+    origins = rng.uniform(-2, 2, (8, 3))
+    rays = target - origins
+    rays[0] = [1.0, 0.0, 0.2]
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    origins = np.concatenate([origins, [[0, 0, 0], [1, 0, 0]]])
+    rays = np.concatenate([rays, [[0, 0, 1.0], [0, 0, 1.0]]])
+    groups = np.array([0] * 8 + [1, 1])
+    points = intersect(origins, rays, groups, 3, rounds=20)
+    assert np.linalg.norm(points[0] - target) < 0.01
+    assert np.isnan(points[1]).all()
+    assert np.isnan(points[2]).all()
+
+
+def test_shared_rays_lists_each_common_track_of_each_edge():
+    truth = make_problem(8, 200, "area")
+    problem = positioning(truth)
+    edge, left, right = shared_rays(problem)
+    assert np.array_equal(problem.ray_tracks[left], problem.ray_tracks[right])
+    assert np.array_equal(problem.ray_images[left], problem.pairs[edge, 0])
+    assert np.array_equal(problem.ray_images[right], problem.pairs[edge, 1])
+    seen = [set(problem.ray_tracks[problem.ray_images == i].tolist()) for i in range(8)]
+    expected = [len(seen[i] & seen[j]) for i, j in truth.pairs.tolist()]
+    assert np.bincount(edge, minlength=len(truth.pairs)).tolist() == expected
+
+
+def test_directions_of_outlier_pairs_are_mended_from_rays():
+    truth = make_problem(20, 1500, "area", 0.5, 0.05, 0.3, 0.3, seed=1)
+    problem = positioning(truth)
+    mended, _ = refine_directions(problem, *shared_rays(problem), np.radians(0.5))
+    baselines = truth.centers[truth.pairs[:, 1]] - truth.centers[truth.pairs[:, 0]]
+    before = np.degrees(angle_between(problem.directions, baselines))
+    after = np.degrees(np.minimum(angle_between(mended, baselines), angle_between(-mended, baselines)))
+    inliers = ~truth.edge_outliers
+    assert np.median(after[inliers]) < 0.8 * np.median(before[inliers])
+    assert (after < 3.0).mean() > (before < 3.0).mean() + 0.1
+
+
+def test_refinement_improves_a_disturbed_start_and_keeps_missing_cameras():
+    truth = make_problem(20, 800, "ring", noise_px=0.5, seed=2)
+    problem = positioning(truth)
+    start = truth.centers + np.random.default_rng(0).normal(0, 0.2, truth.centers.shape)
+    start[4] = np.nan
+    refined, points = refine_angles(problem, start, np.radians(0.1))
+    assert np.isnan(refined[4]).all()
+    keep = np.arange(20) != 4
+    assert errors(refined, truth.centers).max() < 0.05
+    assert errors(start[keep], truth.centers[keep]).max() > 0.2
+    assert points.shape == (problem.ray_tracks.max() + 1, 3)
+
+
+def test_mfas_weighs_wrong_directions_more():
+    truth = make_problem(30, 3000, "area", pair_outlier_ratio=0.15, seed=3)
+    weights = mfas_weights(positioning(truth), 60, 0)
+    assert weights[truth.edge_outliers].mean() > 3.0 * weights[~truth.edge_outliers].mean()
+
+
+@pytest.mark.parametrize("layout", ["ring", "street", "area", "facade"])
+def test_whole_averaging_with_noise_and_outliers(layout):
+    truth = make_problem(40, 2400, layout, 0.7, 0.1, 0.5, 0.1, seed=1)
+    problem = positioning(truth, perturb_rotations(truth.rotations, 0.1, 2))
+    result = average_translations(problem, ScaleChain(), LIMITS)
+    found = errors(result.centers, truth.centers)
+    assert np.isfinite(result.centers).all()
+    assert 1e-4 < np.median(found) < 0.3
+    assert found.max() < 1.5
+    good = result.edge_residuals_rad[~truth.edge_outliers]
+    assert np.degrees(np.median(good)) < 3.0
+    assert np.degrees(np.median(result.ray_residuals_rad)) < 0.2
+    assert len(result.ray_tracks) == len(result.ray_residuals_rad)
+
+
+def test_weak_camera_is_not_thrown_away():
+    truth = make_problem(20, 1200, "area", 0.5, seed=4)
+    problem = positioning(truth)
+    rng = np.random.default_rng(0)
+    mine = np.flatnonzero(problem.ray_images == 7)
+    rays = problem.rays.copy()
+    wild = rng.normal(size=(len(mine), 3))
+    rays[mine] = wild / np.linalg.norm(wild, axis=1, keepdims=True)
+    edges = ~(problem.pairs == 7).any(axis=1)
+    damaged = dataclasses.replace(problem.select_edges(edges), rays=rays)
+    result = average_translations(damaged, ScaleChain(), LIMITS)
+    assert np.isnan(result.centers[7]).all()
+    assert np.isfinite(np.delete(result.centers, 7, axis=0)).all()
+    assert errors(result.centers, truth.centers).max() < 0.2
+
+
+def test_camera_with_a_few_good_rays_is_placed():
+    truth = make_problem(20, 1200, "area", 0.3, seed=4)
+    problem = positioning(truth)
+    mine = np.flatnonzero(problem.ray_images == 7)
+    rows = np.ones(len(problem.rays), dtype=bool)
+    rows[mine[12:]] = False
+    few = problem.select_rays(rows).select_edges(~(problem.pairs == 7).any(axis=1))
+    result = average_translations(few, ScaleChain(), LIMITS)
+    assert np.isfinite(result.centers[7]).all()
+    assert errors(result.centers, truth.centers)[7] < 0.2
+
+
+def test_pairs_alone_position_what_they_determine():
+    truth = make_problem(25, 1500, "area", 0.5, 0.0, 0.2, 0.1, seed=6)
+    problem = positioning(truth)
+    problem = problem.select_rays(np.zeros(len(problem.rays), dtype=bool))
+    result = average_translations(problem, ScaleChain(), LIMITS)
+    assert np.isfinite(result.centers[:, 0]).sum() >= 20
+    assert 1e-4 < np.median(errors(result.centers, truth.centers)) < 0.1
+
+
+def test_two_images_have_a_unit_baseline():
+    truth = make_problem(2, 500, "facade", noise_px=0.1, rotation_noise_deg=0.0)
+    result = average_translations(positioning(truth), ScaleChain(), LIMITS)
+    baseline = result.centers[1] - result.centers[0]
+    assert abs(np.linalg.norm(baseline) - 1.0) < 1e-12
+    assert angle_between(baseline, truth.centers[1] - truth.centers[0]) < 1e-6
+
+
+def test_three_images():
+    truth = make_problem(3, 600, "area", noise_px=0.2, rotation_noise_deg=0.1, seed=8)
+    result = average_translations(positioning(truth), ScaleChain(), LIMITS)
+    assert np.isfinite(result.centers).all()
+    assert errors(result.centers, truth.centers).max() < 0.05
+
+
+def test_nothing_and_the_smaller_of_two_parts_get_no_center():
+    truth = make_problem(16, 900, "area", noise_px=0.3, seed=9)
+    problem = positioning(truth)
+    empty = problem.select_edges(np.zeros(len(problem.pairs), bool)).select_rays(
+        np.zeros(len(problem.rays), bool)
+    )
+    assert np.isnan(average_translations(empty, ScaleChain(), LIMITS).centers).all()
+    lone = problem.select_edges(~(problem.pairs == 3).any(axis=1)).select_rays(problem.ray_images != 3)
+    result = average_translations(lone, ScaleChain(), LIMITS)
+    assert np.isnan(result.centers[3]).all()
+    assert np.isfinite(np.delete(result.centers, 3, axis=0)).all()
+
+
+def test_gauge_and_frame():
+    truth = make_problem(15, 700, "ring", noise_px=0.1)
+    problem = positioning(truth)
+    result = average_translations(problem, ScaleChain(), LIMITS)
+    lengths = np.linalg.norm(result.centers[problem.pairs[:, 1]] - result.centers[problem.pairs[:, 0]], axis=1)
+    assert abs(np.median(lengths) - 1.0) < 1e-9
+    assert np.abs(np.median(result.centers, axis=0)).max() < 1e-9
+    moved = normalize_gauge(problem, 3.0 * result.centers + 5.0)
+    assert np.allclose(moved, result.centers)
+    assert np.median(edge_angles_rad(problem, result.centers)) < np.radians(2.0)
+
+
+def test_result_does_not_depend_on_the_order_of_edges():
+    truth = make_problem(15, 700, "area", seed=3)
+    problem = with_rays(positioning(truth), 50)
+    order = np.random.default_rng(0).permutation(len(problem.pairs))
+    one = average_translations(problem, ScaleChain(), LIMITS).centers
+    two = average_translations(problem.select_edges(order), ScaleChain(), LIMITS).centers
+    assert np.allclose(one, two, atol=1e-6)
+    assert np.array_equal(one, average_translations(problem, ScaleChain(), LIMITS).centers)

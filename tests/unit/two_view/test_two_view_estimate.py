@@ -1,0 +1,155 @@
+"""The two-view geometry of a pair: pose, kind, acceptance, inliers."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from snakesfm.config.estimate_two_view import EstimateTwoViewOptions
+from snakesfm.geometry.rotations import angle_between, angle_of
+from snakesfm.two_view.estimate import TwoViewEstimate, estimate_two_view_geometry
+
+Views = Callable[..., Any]
+OPTIONS = EstimateTwoViewOptions()
+
+
+def estimate(views: Any, options: EstimateTwoViewOptions = OPTIONS, matches: Any = None) -> TwoViewEstimate:
+    return estimate_two_view_geometry(
+        views.keypoints_i,
+        views.keypoints_j,
+        views.matches if matches is None else matches,
+        views.camera_i,
+        views.camera_j,
+        options,
+        seed=3,
+    )
+
+
+def errors_deg(found: TwoViewEstimate, views: Any) -> tuple[float, float]:
+    return (
+        float(np.degrees(angle_of(found.rotation @ views.rotation.T))),
+        float(np.degrees(angle_between(found.translation, views.translation))),
+    )
+
+
+@pytest.mark.parametrize("refine", ["none", "sampson", "bundle"])
+def test_pose_and_inliers_of_a_general_scene(two_views: Views, refine: str) -> None:
+    views = two_views(seed=1)
+    found = estimate(views, EstimateTwoViewOptions.model_validate({"refine": refine}))
+    assert found.rejection == ""
+    assert found.kind == "general"
+    rotation_deg, translation_deg = errors_deg(found, views)
+    assert 1e-5 < rotation_deg < 0.2
+    assert 1e-5 < translation_deg < 0.8
+    assert found.match_count == 300
+    assert 225 <= len(found.inliers) <= 260
+    truth = {tuple(row) for row in views.matches[:240].tolist()}
+    wrong = [row for row in found.inliers.tolist() if tuple(row) not in truth]
+    assert len(wrong) < 12
+    assert 0.15 < found.sigma_px < 0.45
+    assert 5 < found.triangulation_angle_deg < 15
+
+
+def test_noise_far_above_the_threshold_is_adapted_to(two_views: Views) -> None:
+    views = two_views(seed=2, count=400, noise_px=1.2)
+    tight = estimate(views, EstimateTwoViewOptions(adapt_error=False))
+    adapted = estimate(views)
+    assert adapted.rejection == ""
+    assert max(errors_deg(adapted, views)) < 2.5
+    assert adapted.significance >= tight.significance
+
+
+def test_different_focal_lengths(two_views: Views) -> None:
+    views = two_views(seed=3, focal_j=1800.0)
+    found = estimate(views)
+    assert found.rejection == ""
+    assert max(errors_deg(found, views)) < 1.0
+
+
+def test_plane_is_recognised(two_views: Views) -> None:
+    views = two_views(seed=4, scene="plane", count=400)
+    found = estimate(views, EstimateTwoViewOptions(min_ambiguity_gap=0))
+    assert found.kind == "planar"
+    assert found.rejection == ""
+
+
+def test_plane_with_two_equal_poses_is_ambiguous(two_views: Views) -> None:
+    views = two_views(seed=4, scene="plane", count=400, toward=(0.3, 0.1, -0.9))
+    assert estimate(views).rejection == "ambiguous"
+
+
+def test_turning_camera_is_recognised_and_its_direction_unknown(two_views: Views) -> None:
+    views = two_views(seed=5, baseline=0.0)
+    found = estimate(views)
+    assert found.rejection == ""
+    assert found.kind == "rotation_only"
+    assert 1e-6 < errors_deg(found, views)[0] < 0.05
+    assert np.sqrt(found.covariance[3, 3]) > 1.0
+    assert np.degrees(np.sqrt(np.trace(found.covariance[:3, :3]))) < 0.1
+
+
+def test_covariance_tells_the_error(two_views: Views) -> None:
+    ratios = []
+    for seed in range(40):
+        views = two_views(seed=100 + seed, outliers=0, count=150)
+        found = estimate(views)
+        increment = np.radians(errors_deg(found, views)[0])
+        ratios.append(increment**2 / np.trace(found.covariance[:3, :3]))
+    assert 0.5 < np.mean(ratios) < 2.0
+
+
+@pytest.mark.parametrize(
+    ("outliers", "count", "reasons"),
+    [
+        (0, 14, {"too_few_matches"}),
+        (0, 0, {"too_few_matches"}),
+        (300, 300, {"too_few_inliers", "low_inlier_ratio", "not_significant", "estimation_failed"}),
+    ],
+)
+def test_bad_pairs_are_rejected(two_views: Views, outliers: int, count: int, reasons: set[str]) -> None:
+    views = two_views(seed=6, count=max(count, 15), outliers=outliers)
+    assert estimate(views, matches=views.matches[:count]).rejection in reasons
+
+
+def test_switches_of_acceptance(two_views: Views) -> None:
+    views = two_views(seed=7)
+    assert estimate(views, EstimateTwoViewOptions(min_inliers=280)).rejection == "too_few_inliers"
+    assert estimate(views, EstimateTwoViewOptions(min_inlier_ratio=0.95)).rejection == "low_inlier_ratio"
+    assert estimate(views, EstimateTwoViewOptions(min_support=250)).rejection == "not_significant"
+    uncertain = EstimateTwoViewOptions(max_rotation_std_deg=1e-4)
+    assert estimate(views, uncertain).rejection == "indeterminate"
+    before = estimate(views, EstimateTwoViewOptions(ratio_of="estimator", adapt_error=False)).inlier_ratio
+    after = estimate(views, EstimateTwoViewOptions(ratio_of="refined", adapt_error=False)).inlier_ratio
+    assert before < after
+
+
+def test_rejected_without_pose_is_nan_and_empty(two_views: Views) -> None:
+    found = estimate(two_views(seed=8), matches=np.zeros((0, 2), dtype=np.int32))
+    assert np.isnan(found.rotation).all()
+    assert np.isnan(found.translation).all()
+    assert np.isnan(found.covariance).all()
+    assert found.inliers.shape == (0, 2)
+    assert found.inliers.dtype == np.int32
+
+
+def test_same_arguments_same_result(two_views: Views) -> None:
+    views = two_views(seed=9)
+    first, second = estimate(views), estimate(views)
+    assert np.array_equal(first.rotation, second.rotation)
+    assert np.array_equal(first.covariance, second.covariance)
+    assert np.array_equal(first.inliers, second.inliers)
+
+
+def test_keypoints_at_one_place_count_once(two_views: Views) -> None:
+    views = two_views(seed=10, outliers=0, count=100)
+    doubled_i = np.concatenate([views.keypoints_i, views.keypoints_i])
+    doubled_j = np.concatenate([views.keypoints_j, views.keypoints_j])
+    matches = np.concatenate([views.matches, views.matches + 100])
+    found = estimate_two_view_geometry(
+        doubled_i, doubled_j, matches, views.camera_i, views.camera_j, OPTIONS, 3
+    )
+    assert found.match_count == 100
+    assert found.inliers.max() < 100
+    for side in (0, 1):
+        assert len(np.unique(found.inliers[:, side])) == len(found.inliers)

@@ -1,0 +1,214 @@
+"""Stages calibrate_cameras and estimate_two_view on small artifacts."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from snakesfm.artifacts import (
+    CalibratedCameras,
+    Header,
+    ImageIndex,
+    LocalFeatures,
+    PairMatches,
+    TwoViewGeometries,
+)
+from snakesfm.artifacts.pairs import KINDS, REJECTIONS
+from snakesfm.config.calibrate_cameras import CalibrateCamerasOptions
+from snakesfm.config.estimate_two_view import EstimateTwoViewOptions
+from snakesfm.errors import ArtifactError
+from snakesfm.geometry.camera import Camera, cameras_to_columns
+from snakesfm.stages import calibrate_cameras, estimate_two_view
+from snakesfm.stages.job import StageJob
+from snakesfm.two_view.estimate import estimate_two_view_geometry
+
+Views = Callable[..., Any]
+HEADER = Header("test", 1, "scene")
+
+
+def write_inputs(folder: Path, views: Any, source: str) -> dict[str, Any]:
+    """Three images of which 0 and 1 are a pair; image 2 matches image 0 in twelve places only."""
+    camera = Camera("SIMPLE_RADIAL", 1000, 800, (900.0, 500.0, 400.0, 0.0), source)
+    models, sizes, params, sources = cameras_to_columns([camera])
+    names = np.array(["a.jpg", "b.jpg", "c.jpg"], dtype=object)
+    ImageIndex(
+        names=names,
+        sizes=np.tile(np.array([1000, 800], dtype=np.int32), (3, 1)),
+        sha256=names,
+        blocks=np.zeros(3, dtype=np.int32),
+        camera_ids=np.zeros(3, dtype=np.int32),
+        orientations=np.ones(3, dtype=np.int32),
+        focal_exif_px=np.full(3, np.nan),
+        gps=np.full((3, 3), np.nan),
+        duplicate_of=np.full(3, -1, dtype=np.int32),
+        camera_models=np.array(models, dtype=object),
+        camera_sizes=sizes,
+        camera_params=params,
+        camera_sources=np.array(sources, dtype=object),
+        refused_names=np.array([], dtype=object),
+        refused_reasons=np.array([], dtype=object),
+    ).write(folder / "index.h5", HEADER)
+    if source == "given":
+        CalibratedCameras(
+            np.array(models, dtype=object),
+            sizes,
+            params,
+            np.array(sources, dtype=object),
+            np.zeros(1),
+            np.zeros(1, dtype=np.int32),
+        ).write(folder / "cameras.h5", HEADER)
+    keypoints = [views.keypoints_i, views.keypoints_j, views.keypoints_j[:50]]
+    total = sum(len(k) for k in keypoints)
+    LocalFeatures(
+        image_ids=np.arange(3, dtype=np.int32),
+        names=names,
+        digests=np.array(["da", "db", "dc"], dtype=object),
+        offsets=np.cumsum([0, *(len(k) for k in keypoints)]),
+        keypoints=np.concatenate(keypoints),
+        descriptors=np.zeros((total, 8), dtype=np.uint8),
+        scores=np.ones(total, dtype=np.float32),
+        scales=np.ones(total, dtype=np.float32),
+        angles=np.zeros(total, dtype=np.float32),
+        colors=np.zeros((total, 3), dtype=np.uint8),
+    ).write(folder / "features.h5", HEADER)
+    few = np.column_stack([np.arange(12), np.arange(12)]).astype(np.int32)
+    write_matches(folder, [(0, 1), (0, 2)], [views.matches, few])
+    return {
+        "index": folder / "index.h5",
+        "cameras": folder / "cameras.h5",
+        "features": [folder / "features.h5"],
+        "matches": folder / "matches.h5",
+    }
+
+
+def write_matches(folder: Path, pairs: list[tuple[int, int]], matches: list[Any]) -> None:
+    PairMatches(
+        pairs=np.array(pairs, dtype=np.int32).reshape(-1, 2),
+        digests=np.array([f"{i}-{j}" for i, j in pairs], dtype=object),
+        offsets=np.cumsum([0, *(len(m) for m in matches)]),
+        matches=np.concatenate(matches) if matches else np.zeros((0, 2), dtype=np.int32),
+        scores=np.ones(sum(len(m) for m in matches), dtype=np.float32),
+    ).write(folder / "matches.h5", HEADER)
+
+
+def pose_job(folder: Path, inputs: dict[str, Any], **changes: Any) -> StageJob:
+    job = StageJob(
+        "estimate_two_view", "scene", inputs, (folder / "0-0.h5",), EstimateTwoViewOptions(), seed=5
+    )
+    return replace(job, **changes)
+
+
+def test_pairs_of_a_tile(two_views: Views, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    views = two_views(seed=1)
+    estimate_two_view.run(pose_job(tmp_path, write_inputs(tmp_path, views, "given")))
+    found = TwoViewGeometries.read(tmp_path / "0-0.h5")
+    assert found.pairs.tolist() == [[0, 1], [0, 2]]
+    assert [REJECTIONS[r] for r in found.rejections] == ["", "too_few_matches"]
+    assert np.allclose(found.rotations[0], views.rotation, atol=5e-3)
+    assert np.isnan(found.rotations[1]).all()
+    assert found.offsets.tolist() == [0, found.inlier_counts[0], found.inlier_counts[0]]
+    assert len(found.inliers) > 200
+    assert "1 of 2 pairs accepted" in capsys.readouterr().out
+
+
+def test_run_again_gives_the_same_bytes(two_views: Views, tmp_path: Path) -> None:
+    job = pose_job(tmp_path, write_inputs(tmp_path, two_views(seed=2), "given"))
+    estimate_two_view.run(job)
+    first = (tmp_path / "0-0.h5").read_bytes()
+    estimate_two_view.run(job)
+    assert (tmp_path / "0-0.h5").read_bytes() == first
+
+
+def test_unchanged_pairs_are_taken_over(
+    two_views: Views, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    inputs = write_inputs(tmp_path, two_views(seed=3), "given")
+    estimate_two_view.run(pose_job(tmp_path, inputs))
+    again = pose_job(tmp_path, inputs, former=tmp_path / "0-0.h5", outputs=(tmp_path / "again.h5",))
+    with monkeypatch.context() as patch:
+        patch.setattr(estimate_two_view, "estimate_two_view_geometry", None)
+        estimate_two_view.run(again)
+    assert (tmp_path / "again.h5").read_bytes() == (tmp_path / "0-0.h5").read_bytes()
+    calls = []
+
+    def counted(*arguments: Any) -> Any:
+        calls.append(arguments)
+        return original(*arguments)
+
+    original = estimate_two_view_geometry
+    monkeypatch.setattr(estimate_two_view, "estimate_two_view_geometry", counted)
+    estimate_two_view.run(replace(again, options=EstimateTwoViewOptions(min_inliers=20)))
+    assert len(calls) == 2
+
+
+def test_damaged_former_is_ignored(two_views: Views, tmp_path: Path) -> None:
+    inputs = write_inputs(tmp_path, two_views(seed=4), "given")
+    (tmp_path / "former.h5").write_bytes(b"no artifact")
+    estimate_two_view.run(pose_job(tmp_path, inputs, former=tmp_path / "former.h5"))
+    assert len(TwoViewGeometries.read(tmp_path / "0-0.h5").pairs) == 2
+
+
+def test_tile_without_pairs(two_views: Views, tmp_path: Path) -> None:
+    inputs = write_inputs(tmp_path, two_views(seed=5), "given")
+    write_matches(tmp_path, [], [])
+    estimate_two_view.run(pose_job(tmp_path, inputs))
+    assert TwoViewGeometries.read(tmp_path / "0-0.h5").pairs.shape == (0, 2)
+
+
+def test_matches_of_unknown_images_are_refused(two_views: Views, tmp_path: Path) -> None:
+    views = two_views(seed=6)
+    inputs = write_inputs(tmp_path, views, "given")
+    inputs["features"] = []
+    with pytest.raises(ArtifactError, match=r"a\.jpg"):
+        estimate_two_view.run(pose_job(tmp_path, inputs))
+
+
+@pytest.mark.parametrize("source", ["given", "default"])
+def test_calibration_stage(two_views: Views, tmp_path: Path, source: str) -> None:
+    inputs = write_inputs(tmp_path, two_views(seed=7), source)
+    job = StageJob(
+        "calibrate_cameras", "scene", inputs, (tmp_path / "out.h5",), CalibrateCamerasOptions(), seed=5
+    )
+    calibrate_cameras.run(job)
+    found = CalibratedCameras.read(tmp_path / "out.h5")
+    # one pair is too few to vote, so the prior stays
+    assert found.sources.tolist() == [source]
+    assert found.params[0, 0] == 900.0
+    assert np.isnan(found.focal_sigma[0]) == (source == "default")
+
+
+def test_calibration_stage_estimates(two_views: Views, tmp_path: Path) -> None:
+    inputs = write_inputs(tmp_path, two_views(seed=8, count=400), "exif")
+    options = CalibrateCamerasOptions(min_votes=1, systematic_sigma=0.0, max_sigma=10.0)
+    job = StageJob("calibrate_cameras", "scene", inputs, (tmp_path / "out.h5",), options, seed=5)
+    calibrate_cameras.run(job)
+    found = CalibratedCameras.read(tmp_path / "out.h5")
+    assert found.params[0, 0] == pytest.approx(900.0, rel=0.1)
+    assert found.params[0, 3] == 0.0
+
+
+def test_calibration_stage_without_pairs(two_views: Views, tmp_path: Path) -> None:
+    inputs = write_inputs(tmp_path, two_views(seed=9), "default")
+    write_matches(tmp_path, [], [])
+    job = StageJob(
+        "calibrate_cameras", "scene", inputs, (tmp_path / "out.h5",), CalibrateCamerasOptions(), seed=5
+    )
+    calibrate_cameras.run(job)
+    assert CalibratedCameras.read(tmp_path / "out.h5").sources.tolist() == ["default"]
+
+
+def test_identical_images_are_a_pair_that_only_turns(two_views: Views, tmp_path: Path) -> None:
+    views = two_views(seed=10, outliers=0)
+    same = replace(
+        views,
+        keypoints_j=views.keypoints_i,
+        matches=np.column_stack([np.arange(300), np.arange(300)]).astype(np.int32),
+    )
+    estimate_two_view.run(pose_job(tmp_path, write_inputs(tmp_path, same, "given")))
+    found = TwoViewGeometries.read(tmp_path / "0-0.h5")
+    assert KINDS[found.kinds[0]] == "rotation_only"
+    assert np.allclose(found.rotations[0], np.eye(3), atol=1e-4)
+    assert np.isfinite(found.covariances[0]).all()

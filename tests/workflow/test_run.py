@@ -1,0 +1,187 @@
+"""Whole runs on a small rendered scene: results, resuming, re-running, killing."""
+
+import json
+import shutil
+import signal
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pycolmap
+import pytest
+from workflow_helpers import copy_run, model_bytes
+
+from snakesfm.artifacts import Reconstruction
+from snakesfm.config.configuration import STAGES
+
+MAPPING = [
+    "build_view_graph",
+    "filter_view_graph",
+    "average_rotations",
+    "build_tracks",
+    "average_translations",
+    "triangulate_tracks",
+    "adjust_bundle",
+    "export_model",
+    "evaluate_model",
+    "render_report",
+]
+
+pytestmark = pytest.mark.workflow
+
+
+def config_of(scene: Path) -> list[str]:
+    return [
+        "--config",
+        f"images={scene / 'images'}",
+        f"reference={scene / 'reference'}",
+        "output=out",
+    ]
+
+
+def test_a_run_gives_a_model_that_others_can_read(finished, small_scene: Path) -> None:
+    output, outcome = finished
+    model = pycolmap.Reconstruction(str(output / "export_model" / "sparse" / "0"))
+    assert model.num_reg_images() == 16
+    assert 0.05 < model.compute_mean_reprojection_error() < 1.0
+    for image in model.images.values():
+        assert (output / "export_model" / "images" / image.name).is_file()
+    frames = json.loads((output / "export_model" / "transforms.json").read_text())["frames"]
+    assert len(frames) == 16
+    metrics = json.loads((output / "evaluate_model" / "metrics.json").read_text())
+    flat = json.dumps(metrics)
+    assert "16" in flat
+    assert (output / "render_report" / "index.html").stat().st_size > 2000
+    line = outcome.summary[-1]
+    for part in ("'square'", "16 of 16 images", "points", "px", str(Path("out") / "square")):
+        assert part in line
+
+
+def test_a_run_is_accurate(finished) -> None:
+    metrics = json.loads((finished[0] / "evaluate_model" / "metrics.json").read_text())
+    assert 85.0 < metrics["relative_pose_auc_1deg"] <= 100.0
+    assert 94.0 < metrics["relative_pose_auc_5deg"] <= 100.0
+
+
+def test_every_stage_says_what_it_is_in_its_artifacts(finished) -> None:
+    for file in finished[0].rglob("*.h5"):
+        with h5py.File(file) as content:
+            stage = content.attrs["stage"]
+            assert stage in STAGES
+            assert stage in file.parts
+            assert content.attrs["scene"] == "square"
+            json.loads(content.attrs["options"])
+
+
+def test_a_second_run_does_nothing(finished, small_scene: Path, workflow) -> None:
+    copy_run(finished[0], workflow.folder)
+    outcome = workflow.run(*config_of(small_scene))
+    assert outcome.status == 0
+    assert outcome.rules == []
+    assert "Nothing to be done" in outcome.text
+
+
+def test_touched_images_and_scripts_change_nothing(finished, small_scene: Path, workflow) -> None:
+    copy_run(finished[0], workflow.folder)
+    for image in (small_scene / "images").iterdir():
+        image.touch()
+    outcome = workflow.run(*config_of(small_scene))
+    assert outcome.rules == []
+
+
+def test_a_deleted_tile_is_made_again_with_what_depends_on_it_alone(
+    finished, small_scene: Path, workflow
+) -> None:
+    copy_run(finished[0], workflow.folder)
+    output = workflow.folder / "out" / "square"
+    (output / "match_pairs" / "0-1.h5").unlink()
+    outcome = workflow.run(*config_of(small_scene))
+    assert outcome.status == 0, outcome.text
+    assert sorted(outcome.rules) == sorted(
+        ["match_pairs", "calibrate_cameras", *["estimate_two_view"] * 3, *MAPPING]
+    )
+    assert model_bytes(output) == model_bytes(finished[0])
+
+
+def test_an_option_reaches_its_stage_and_what_follows_alone(finished, small_scene: Path, workflow) -> None:
+    copy_run(finished[0], workflow.folder)
+    outcome = workflow.run("--dry-run", *config_of(small_scene), "adjust_bundle={loss: cauchy}")
+    assert sorted(set(outcome.rules)) == sorted(MAPPING[6:])
+
+
+def test_an_added_image_is_indexed(finished, small_scene: Path, workflow) -> None:
+    copy_run(finished[0], workflow.folder)
+    scene = workflow.folder / "square"
+    shutil.copytree(small_scene, scene)
+    images = sorted((scene / "images").iterdir())
+    shutil.copy(images[3], scene / "images" / "zz_copy.jpg")
+    outcome = workflow.run("--dry-run", *config_of(scene))
+    assert outcome.rules.count("index_images") == 1
+
+
+@pytest.mark.parametrize(
+    ("stage", "number"),
+    [("extract_features", signal.SIGKILL), ("match_pairs", signal.SIGKILL), ("adjust_bundle", signal.SIGTERM)],
+)
+def test_a_killed_run_ends_with_the_same_model_when_started_again(
+    finished, small_scene: Path, workflow, stage: str, number: int
+) -> None:
+    copy_run(finished[0], workflow.folder)
+    output = workflow.folder / "out" / "square"
+    shutil.rmtree(output / stage)
+    shutil.rmtree(output / "logs" / stage)
+    workflow.kill_when(
+        lambda: (output / "logs" / stage).is_dir(), *config_of(small_scene), number=number
+    )
+    assert not (output / "export_model" / "summary.json").is_file() or stage != "adjust_bundle"
+    outcome = workflow.run(*config_of(small_scene))
+    assert outcome.status == 0, outcome.text
+    assert model_bytes(output) == model_bytes(finished[0])
+    leftovers = [path for path in output.rglob(".*") if path.is_file() and ".former" not in path.parts]
+    assert not [path for path in leftovers if path.name.endswith(".tmp")]
+
+
+def test_blocks_cores_and_order_do_not_change_the_model(finished, small_scene: Path, workflow) -> None:
+    outcome = workflow.run(*config_of(small_scene), "blocks=3", cores=1)
+    assert outcome.status == 0, outcome.text
+    first = Reconstruction.read(finished[0] / "adjust_bundle" / "reconstruction.h5")
+    second = Reconstruction.read(workflow.folder / "out" / "square" / "adjust_bundle" / "reconstruction.h5")
+    np.testing.assert_array_equal(first.rotations, second.rotations)
+    np.testing.assert_array_equal(first.translations, second.translations)
+    np.testing.assert_array_equal(first.points, second.points)
+
+
+def test_two_runs_at_once_on_one_output_are_refused(finished, small_scene: Path, workflow) -> None:
+    import fcntl
+
+    copy_run(finished[0], workflow.folder)
+    (workflow.folder / "out" / "square" / "render_report" / "index.html").unlink()
+    with open(workflow.folder / "out" / ".snakesfm.lock", "w") as lock:
+        lock.write("process 1 on elsewhere")
+        lock.flush()
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        outcome = workflow.run(*config_of(small_scene))
+    assert outcome.status != 0
+    assert "Another run (process 1 on elsewhere)" in outcome.text
+    assert "Traceback" not in outcome.text
+    assert outcome.rules == []
+
+
+def test_several_scenes_run_together_and_a_bad_one_does_not_stop_the_others(
+    finished, small_scene: Path, workflow
+) -> None:
+    copy_run(finished[0], workflow.folder)
+    single = workflow.folder / "single"
+    single.mkdir()
+    shutil.copy(sorted((small_scene / "images").iterdir())[0], single)
+    (workflow.folder / "mine.yaml").write_text(
+        f"output: out\nscenes:\n  single: {{images: {single}}}\n"
+        f"  square: {{images: {small_scene / 'images'}, reference: {small_scene / 'reference'}}}\n"
+    )
+    (workflow.folder / "out" / "square" / "render_report" / "index.html").unlink()
+    outcome = workflow.run("--configfile", "mine.yaml")
+    assert outcome.status != 0
+    lines = {line.split("'")[1]: line for line in outcome.summary}
+    assert "16 of 16 images" in lines["square"]
+    assert "failed" in lines["single"]
+    assert "Traceback" not in outcome.text
