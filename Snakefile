@@ -29,7 +29,7 @@ localrules:
 rule all:
     default_target: True
     input:
-        final_files(),
+        all_files(),
 
 
 onstart:

@@ -100,7 +100,9 @@ def _table(cls: type[BaseModel]) -> list[str]:
     properties = cls.model_json_schema()["properties"]
     rows = ["| key | default | allowed | meaning |", "|---|---|---|---|"]
     for name, field in cls.model_fields.items():
-        default = "required" if field.is_required() else _plain(field.get_default(call_default_factory=True))
+        default = (
+            "required" if field.is_required() else _plain(field.get_default(call_default_factory=True))
+        )
         meaning = " ".join((field.description or "").split())
         rows.append(f"| `{name}` | {default} | {_allowed(properties[name])} | {meaning} |")
     return rows

@@ -15,8 +15,8 @@ THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"
 def run_job(stage: str, snakemake: Any) -> None:
     """Run one stage as a Snakemake job.
 
-    Standard output and error of this process, C++ libraries included, go to the job's log; progress and the one
-    sentence of an error go to the terminal too.
+    Standard output and error of this process, C++ libraries included, go to the job's log; progress and the
+    one sentence of an error go to the terminal too.
 
     Parameters
     ----------
@@ -90,7 +90,7 @@ def _keep_former(job: Any) -> None:
     try:
         former.parent.mkdir(exist_ok=True)
         os.link(job.output, temporary)
-        os.replace(temporary, former)
+        temporary.replace(former)
     except OSError as error:
         print(f"warning: {former} could not be kept ({error}); a re-run computes everything anew.")
 
@@ -111,7 +111,7 @@ def _fail(stage: str, snakemake: Any, error: Exception, terminal: Any) -> None:
         traceback.print_exc()
     else:
         traceback.print_exc()
-        sentence = f"Unexpected {type(error).__name__}: {error}; the log {snakemake.log[0]} holds the details."
+        sentence = f"Unexpected {type(error).__name__}: {error}; {snakemake.log[0]} holds the details."
     print(f"error: {sentence}", flush=True)
     print(f"snakesfm: scene '{scene}', {stage}: {sentence}", file=terminal, flush=True)
     sys.stdout.flush()

@@ -1,7 +1,7 @@
 """What the Snakefile asks: which scenes, blocks, tiles and params there are.
 
-Everything here is computed from the configuration and the listing of the image folders, so the graph of jobs
-is known before anything runs.
+Everything here is computed from the configuration and the listing of the image folders, so the graph of
+jobs is known before anything runs.
 """
 
 import functools
@@ -19,6 +19,18 @@ from snakesfm.ingest.discover import count_images, fingerprint_images
 # images up to which so many blocks are used; powers of two, so that adding images rarely re-deals them
 BLOCK_LADDER = ((60, 2), (500, 4), (1_500, 8), (4_000, 16), (15_000, 32), (50_000, 64))
 MOST_BLOCKS = 128
+
+SCENE_ARTIFACTS = (
+    "index_images/index.h5",
+    "calibrate_cameras/cameras.h5",
+    "build_view_graph/graph.h5",
+    "filter_view_graph/graph.h5",
+    "average_rotations/rotations.h5",
+    "build_tracks/tracks.h5",
+    "average_translations/centers.h5",
+    "triangulate_tracks/points.h5",
+    "adjust_bundle/reconstruction.h5",
+)
 
 
 def choose_blocks(image_count: int) -> int:
@@ -112,9 +124,20 @@ class ScenePlan:
         return self.files("describe_images", "blocks") if self.select_pairs.needs_descriptors else []
 
     def final_files(self) -> list[str]:
-        """What a run makes of the scene: its model, its metrics and its report."""
+        """What a person looks at: the scene's model, its metrics and its report."""
         names = ("export_model/summary.json", "evaluate_model/metrics.json", "render_report/index.html")
         return [str(self.folder / name) for name in names]
+
+    def all_files(self) -> list[str]:
+        """What a run makes of the scene; Snakemake re-makes a lost file only if it is asked for by name."""
+        files = [str(self.folder / name) for name in SCENE_ARTIFACTS]
+        files += self.files("extract_features", "blocks")
+        for stage in ("select_pairs", "match_pairs", "estimate_two_view"):
+            files += self.files(stage, "tiles")
+        if self.select_pairs.needs_descriptors:
+            files.append(str(self.folder / "learn_vocabulary" / "vocabulary.h5"))
+            files += self.files("describe_images", "blocks")
+        return files + self.final_files()
 
     @functools.cached_property
     def _fingerprint(self) -> str:
@@ -195,5 +218,5 @@ class Plan:
         return groups
 
     def select_pairs_rule(self, blocks: int) -> str:
-        """The name of the rule select_pairs for a number of blocks; plain where one rule serves all scenes."""
+        """The name of rule select_pairs for a number of blocks; plain where one serves all scenes."""
         return "select_pairs" if len(self.scenes_by_blocks()) == 1 else f"select_pairs_{blocks}_blocks"

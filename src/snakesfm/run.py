@@ -31,7 +31,7 @@ class Run:
         path = self.plan.output / LOCK_NAME
         try:
             self.plan.output.mkdir(parents=True, exist_ok=True)
-            self.lock = open(path, "a+", encoding="utf-8")  # noqa: SIM115 - held until the process ends
+            self.lock = path.open("a+", encoding="utf-8")
         except OSError as error:
             raise ConfigError(
                 f"The output folder '{self.plan.output}' cannot be written ({error.strerror}): "

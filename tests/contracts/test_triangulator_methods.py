@@ -70,9 +70,21 @@ class TriangulatorContract:
         assert np.isfinite(points[:, 0]).mean() < 0.2 and inliers.mean() < 0.2
 
     def test_nearly_parallel_rays_give_no_point(self, triangulate):
-        made = make_problem(12, 200, noise_px=0.0)
-        points, inliers = triangulate(as_problem(made), replace(LIMITS, min_angle_deg=89.0))
+        point, centers = np.array([0.2, 0.1, 50.0]), np.array([[0.0, 0, 0], [0.1, 0, 0], [0.2, 0, 0]])
+        seen = point - centers
+        narrow = TriangulationProblem(
+            np.repeat(np.eye(3)[None], 3, axis=0),
+            -centers,
+            np.full(3, 500.0),
+            np.array([0, 3]),
+            np.arange(3),
+            seen[:, :2] / seen[:, 2:],
+        )
+        points, inliers = triangulate(narrow, LIMITS)
         assert np.isnan(points).all() and not inliers.any()
+        points, inliers = triangulate(narrow, replace(LIMITS, min_angle_deg=0.1))
+        np.testing.assert_allclose(points[0], point, atol=1e-3)
+        assert inliers.all()
 
     def test_empty_and_single_observations(self, triangulate):
         made = as_problem(make_problem(5, 60))

@@ -113,7 +113,11 @@ def test_a_failing_writer_leaves_the_old_file_and_no_rest(tmp_path: Path) -> Non
 
 
 @settings(max_examples=25, deadline=None)
-@given(st.lists(st.text(min_size=1, max_size=12).filter(lambda t: "\0" not in t and t.isprintable()), max_size=5))
+@given(
+    st.lists(
+        st.text(min_size=1, max_size=12).filter(lambda t: "\0" not in t and t.isprintable()), max_size=5
+    )
+)
 def test_any_text_survives(tmp_path_factory: pytest.TempPathFactory, texts: list[str]) -> None:
     path = tmp_path_factory.mktemp("text") / "a.h5"
     pairs = np.zeros((len(texts), 2), dtype=np.int32)

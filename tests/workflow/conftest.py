@@ -60,7 +60,9 @@ class Workflow:
         )
         return Outcome(done.returncode, done.stdout)
 
-    def kill_when(self, condition: Callable[[], bool], *arguments: str, number: int = signal.SIGKILL) -> None:
+    def kill_when(
+        self, condition: Callable[[], bool], *arguments: str, number: int = signal.SIGKILL
+    ) -> None:
         """Start a run and kill all its processes as soon as a condition holds."""
         with subprocess.Popen(
             self.command(*arguments),

@@ -19,5 +19,7 @@ def test_generated_file_is_up_to_date(root: Path, name: str) -> None:
 
 def test_config_yaml_is_valid_and_holds_the_defaults(root: Path) -> None:
     values = yaml.safe_load((root / "config.yaml").read_text("utf-8"))
-    jsonschema.validate(values, json.loads((root / "workflow/schemas/config.schema.json").read_text("utf-8")))
+    jsonschema.validate(
+        values, json.loads((root / "workflow/schemas/config.schema.json").read_text("utf-8"))
+    )
     assert load_configuration(values) == load_configuration({})

@@ -8,7 +8,14 @@ import pytest
 
 from snakesfm.config.configuration import STAGES, configuration_class, options_class
 
-DOMAIN_MAY_IMPORT_NOT = ("snakesfm.stages", "snakesfm.artifacts", "snakesfm.plan", "snakesfm.job", "h5py", "snakemake")
+DOMAIN_MAY_IMPORT_NOT = (
+    "snakesfm.stages",
+    "snakesfm.artifacts",
+    "snakesfm.plan",
+    "snakesfm.job",
+    "h5py",
+    "snakemake",
+)
 NO_DOMAIN = {"stages", "artifacts", "config"}
 
 
@@ -73,7 +80,9 @@ def test_domains_import_no_stage_no_artifact_and_no_workflow(file: Path) -> None
             imported |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom) and node.module:
             imported.add(node.module)
-    wrong = {name for name in imported for ban in DOMAIN_MAY_IMPORT_NOT if (name + ".").startswith(ban + ".")}
+    wrong = {
+        name for name in imported for ban in DOMAIN_MAY_IMPORT_NOT if (name + ".").startswith(ban + ".")
+    }
     assert not wrong
 
 

@@ -73,9 +73,9 @@ def job_params(stage):
     return render
 
 
-def final_files():
-    """What a run makes: the report of every scene, and so everything else."""
-    return [path for scene in PLAN.scenes.values() for path in scene.final_files()]
+def all_files():
+    """What a run makes of all scenes."""
+    return [path for scene in PLAN.scenes.values() for path in scene.all_files()]
 
 
 def start_run():

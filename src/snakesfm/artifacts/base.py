@@ -80,9 +80,7 @@ class Artifact:
             array = array.reshape([int(d) if d.isdigit() else 0 for d in dims])
         return array
 
-    def _check_shape(
-        self, field: "dataclasses.Field[Any]", value: Array, lengths: dict[str, int]
-    ) -> None:
+    def _check_shape(self, field: "dataclasses.Field[Any]", value: Array, lengths: dict[str, int]) -> None:
         dims = _dimensions(field.metadata["shape"])
         if value.ndim != len(dims):
             raise ValueError(
@@ -182,15 +180,15 @@ class atomic_path:  # noqa: N801 - used as a function, like contextlib's
         self.path.parent.mkdir(parents=True, exist_ok=True)
         handle, name = tempfile.mkstemp(prefix=f".{self.path.name}.", dir=self.path.parent)
         os.close(handle)
-        os.chmod(name, 0o666 & ~_umask())
         self.temporary = Path(name)
+        self.temporary.chmod(0o666 & ~_umask())
         return self.temporary
 
     def __exit__(self, kind: object, error: object, trace: object) -> None:
         if kind is None:
-            with open(self.temporary, "rb+") as file:
+            with self.temporary.open("rb+") as file:
                 os.fsync(file.fileno())
-            os.replace(self.temporary, self.path)
+            self.temporary.replace(self.path)
         else:
             self.temporary.unlink(missing_ok=True)
 

@@ -19,7 +19,7 @@ class LocalFeatures(Artifact):
     keypoints: Array = column("(K,2)", "float32", "x, y in original pixels, first pixel's centre (.5,.5)")
     descriptors: Array = column("(K,D)", "uint8", "512 x RootSIFT, clipped to 255")
     scores: Array = column("(K)", "float32", "detector response, larger is stronger")
-    scales: Array = column("(K)", "float32", "diameter of the described patch in original pixels")
+    scales: Array = column("(K)", "float32", "diameter in original pixels, twice SIFT's sigma")
     angles: Array = column("(K)", "float32", "orientation in radians")
     colors: Array = column("(K,3)", "uint8", "RGB of the image at the keypoint")
 

@@ -8,7 +8,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from snakesfm.tracks.canonical import canonical_keypoints
+from snakesfm.bundle.model import observations_of
 
 Array = NDArray[Any]
 
@@ -20,24 +20,38 @@ def correspondence_graph(
 
     Parameters
     ----------
-    keypoints : per image (K_i,2), pixels; keypoints at one place count as the first of them.
+    keypoints : per image (K_i,2), pixels.
     pairs : (P,2) int, images i < j.
     offsets : (P+1,) int64, rows ``offsets[k]:offsets[k+1]`` of ``matches`` belong to pair k.
     matches : (M,2) int, keypoint rows in image i and in image j.
     """
     graph = pycolmap.CorrespondenceGraph()
-    canonical = [canonical_keypoints(points) for points in keypoints]
     for row, points in enumerate(keypoints):
         graph.add_image(row + 1, len(points))
     for row, (i, j) in enumerate(pairs.tolist()):
         found = matches[offsets[row] : offsets[row + 1]]
-        found = np.unique(np.c_[canonical[i][found[:, 0]], canonical[j][found[:, 1]]], axis=0)
         geometry = pycolmap.TwoViewGeometry()
         geometry.config = pycolmap.TwoViewGeometryConfiguration.CALIBRATED
         geometry.inlier_matches = found.astype(np.uint32)
         graph.add_two_view_geometry(i + 1, j + 1, geometry)
     graph.finalize()
     return graph
+
+
+def drop_repeated_observations(reconstruction: pycolmap.Reconstruction) -> int:
+    """Keep the first of several observations of a point by one image; how many were dropped.
+
+    pycolmap's completion and merging do not prevent them, notably where SIFT gave one place twice.
+    """
+    ids = sorted(reconstruction.point3D_ids())
+    _, points, images, rows = observations_of(reconstruction)
+    order = np.lexsort((rows, images, points))
+    again = (np.diff(points[order]) == 0) & (np.diff(images[order]) == 0)
+    repeated = order[1:][again]
+    for row in repeated.tolist():
+        if reconstruction.exists_point3D(ids[points[row]]):
+            reconstruction.delete_observation(int(images[row]) + 1, int(rows[row]))
+    return len(repeated)
 
 
 class TrackCompleter:
@@ -80,4 +94,5 @@ class TrackCompleter:
             triangulator.triangulate_image(self.options, image_id)
         triangulator.complete_all_tracks(self.options)
         triangulator.merge_all_tracks(self.options)
+        drop_repeated_observations(self.reconstruction)
         return int(self.reconstruction.compute_num_observations() - before)

@@ -21,7 +21,7 @@ class SolverSettings:
     """
 
     loss: Loss = "cauchy"
-    loss_scale_px: float = 1.0
+    loss_scale_px: float = 0.5
     constant_cameras: frozenset[int] = frozenset()
     refine_focal: bool = True
     refine_distortion: bool = True

@@ -22,6 +22,8 @@ from snakesfm.geometry.camera import Camera
 
 Array = NDArray[Any]
 
+EARLY_TOLERANCE = 10.0
+
 
 @dataclass(frozen=True)
 class RoundSettings:
@@ -29,7 +31,7 @@ class RoundSettings:
 
     solver: Literal["ceres", "gtsam"] = "ceres"
     thresholds_px: tuple[float, ...] = (10.0, 5.0, 3.0)
-    rotations_first: bool = True
+    rotations_first: bool = False
     max_focal_change: float = 3.0
     max_distortion: float = 1.0
     complete_tracks: bool = True
@@ -85,14 +87,15 @@ def adjust_rounds(
     report : called with each record as soon as it is there.
     """
     mapper = _Mapper(reconstruction, graph, cameras, solving, settings, report)
+    last = len(settings.thresholds_px) - 1
     if settings.rotations_first:
         mapper.round("rotations fixed", settings.thresholds_px[0] * 2, constant_rotations=True)
     for row, threshold in enumerate(settings.thresholds_px):
         if row and settings.complete_tracks:
             mapper.completer()
-        mapper.round(f"round {row + 1}", threshold)
+        mapper.round(f"round {row + 1}", threshold, final=row == last)
     while settings.register_images and mapper.register():
-        mapper.round("registration", settings.thresholds_px[-1])
+        mapper.round("registration", settings.thresholds_px[-1], final=True)
     return mapper.records
 
 
@@ -120,9 +123,13 @@ class _Mapper:
             reconstruction, graph, settings.complete_error_px, settings.min_angle_deg, settings.seed
         )
 
-    def round(self, name: str, threshold_px: float, constant_rotations: bool = False) -> None:
-        """One pass of the solver and the filters after it."""
-        settings, solving = self.settings, replace(self.solving, constant_rotations=constant_rotations)
+    def round(
+        self, name: str, threshold_px: float, constant_rotations: bool = False, final: bool = False
+    ) -> None:
+        """One pass of the solver and the filters after it; early passes need not converge."""
+        settings = self.settings
+        tolerance = self.solving.function_tolerance * (1.0 if final else EARLY_TOLERANCE)
+        solving = replace(self.solving, constant_rotations=constant_rotations, function_tolerance=tolerance)
         drop_short_tracks(self.reconstruction, settings.min_track_length)
         costs = self.adjust(self.reconstruction, solving)
         wild = reset_wild_cameras(
@@ -135,7 +142,8 @@ class _Mapper:
         filter_observations(
             self.reconstruction, threshold_px, settings.min_angle_deg, settings.min_track_length
         )
-        deregister_weak_images(self.reconstruction, settings.min_observations)
+        if final:
+            deregister_weak_images(self.reconstruction, settings.min_observations)
         self.reconstruction.update_point_3d_errors()
         record = RoundRecord(
             name,

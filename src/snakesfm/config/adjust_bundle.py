@@ -21,10 +21,10 @@ class AdjustBundleOptions(StageOptions):
     loss: Literal["huber", "cauchy", "squared"] = "cauchy"
     """Robust loss of the reprojection errors."""
 
-    loss_scale_px: float = Field(default=1.0, gt=0.0, le=100.0)
+    loss_scale_px: float = Field(default=0.5, gt=0.0, le=100.0)
     """Reprojection error from which on the loss grows more slowly."""
 
-    rotations_first: bool = True
+    rotations_first: bool = False
     """Start with a pass that holds the averaged rotations fixed."""
 
     refine_focal: bool = True
@@ -69,5 +69,5 @@ class AdjustBundleOptions(StageOptions):
     max_iterations: int = Field(default=100, ge=1)
     """Iterations of the solver per pass."""
 
-    function_tolerance: float = Field(default=1e-6, gt=0.0)
-    """Relative decrease of the cost at which a pass ends."""
+    function_tolerance: float = Field(default=1e-5, gt=0.0)
+    """Relative decrease of the cost at which the last pass ends; earlier ones end at ten times as much."""

@@ -29,7 +29,7 @@ class AverageTranslationsOptions(StageOptions):
     """Weight of a two-view direction against that of a ray when the angles are refined."""
 
     reject_outliers: Literal["mfas", "residual", "none"] = "residual"
-    """How translation_recovery refuses two-view directions: 1DSfM's MFAS, or a first solution's residuals."""
+    """How translation_recovery refuses edges: MFAS of 1DSfM, or a first solution's residuals."""
 
     mfas_projections: int = Field(default=100, ge=1)
     """One-dimensional projections of MFAS."""
@@ -52,7 +52,7 @@ class AverageTranslationsOptions(StageOptions):
     min_support: int = Field(default=6, ge=1)
     """A camera keeps its centre when so many of its rays meet their landmarks."""
 
-    min_support_ratio: float = Field(default=0.25, ge=0, le=1)
+    min_support_ratio: float = Field(default=0.5, ge=0, le=1)
     """A camera keeps its centre when such a share of its rays meet their landmarks."""
 
     max_relative_sigma: float = Field(default=0.1, gt=0)

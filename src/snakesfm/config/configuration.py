@@ -177,7 +177,9 @@ def list_scenes(configuration: RunOptions) -> dict[str, SceneInputs]:
     elif configuration.images != RunOptions.model_fields["images"].default:
         raise ConfigError("Give either 'images' or 'scenes', not both: remove one of the two keys.")
     if re.search("[{}]", configuration.output):
-        raise ConfigError(f"The output folder '{configuration.output}' holds braces: give another output=DIR.")
+        raise ConfigError(
+            f"The output folder '{configuration.output}' holds braces: give another output=DIR."
+        )
     for name in scenes:
         if not re.fullmatch(SCENE_PATTERN, name):
             raise ConfigError(

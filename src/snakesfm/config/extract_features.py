@@ -25,7 +25,7 @@ class ExtractFeaturesOptions(StageOptions):
     """Least contrast of a SIFT keypoint, as in OpenCV; lower finds more keypoints in flat images."""
 
     upright: bool = False
-    """Describe keypoints upright: more matches if no camera was turned about its axis, else pairs are lost."""
+    """Describe keypoints upright: more matches, but none between cameras turned about their axis."""
 
     edge_threshold: float = Field(10.0, ge=1.0, le=100.0)
     """Largest ratio of principal curvatures of a SIFT keypoint; lower refuses more points on edges."""

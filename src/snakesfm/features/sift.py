@@ -86,7 +86,7 @@ class SiftDetector:
             found, descriptors = sift.detectAndCompute(gray, None)
             return found, descriptors, len(found) < wanted
         found = sift.detect(gray, None)
-        places = {}
+        places: dict[tuple[float, float], Any] = {}
         for point in sorted(found, key=lambda point: -point.response):
             point.angle = 0.0
             places.setdefault(point.pt, point)

@@ -12,12 +12,14 @@ Array = NDArray[Any]
 
 def center_of(rotations: Array, translations: Array) -> Array:
     """Camera centres (..., 3) in the world of cam_from_world poses: -R^T t."""
-    return -np.einsum("...ji,...j->...i", rotations, translations)
+    centers: Array = -np.einsum("...ji,...j->...i", rotations, translations)
+    return centers
 
 
 def translation_of(rotations: Array, centers: Array) -> Array:
     """cam_from_world translations (..., 3) from rotations and camera centres: -R c."""
-    return -np.einsum("...ij,...j->...i", rotations, centers)
+    translations: Array = -np.einsum("...ij,...j->...i", rotations, centers)
+    return translations
 
 
 def to_rigid3d(rotation: Array, translation: Array) -> pycolmap.Rigid3d:

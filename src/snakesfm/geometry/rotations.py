@@ -31,10 +31,12 @@ def log_so3(rotations: Array) -> Array:
 
 def angle_of(rotations: Array) -> Array:
     """Angles (...,) in radians of matrices (..., 3, 3); exact for small angles too."""
-    return np.linalg.norm(log_so3(rotations), axis=-1)
+    angles: Array = np.linalg.norm(log_so3(rotations), axis=-1)
+    return angles
 
 
 def angle_between(a: Array, b: Array) -> Array:
     """Angles (...,) in radians between vectors (..., 3), stable near 0 and pi."""
     cross = np.linalg.norm(np.cross(a, b), axis=-1)
-    return np.arctan2(cross, np.sum(a * b, axis=-1))
+    angles: Array = np.arctan2(cross, np.sum(a * b, axis=-1))
+    return angles

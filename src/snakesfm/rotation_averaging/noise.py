@@ -10,47 +10,49 @@ Array = NDArray[Any]
 DEGREES_OF_FREEDOM = 4.0
 """Of the Student t distribution of the residuals."""
 
-FLOORS = (0.0, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 100.0)
+FLOORS = (0.001, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 100.0)
 """Isotropic noise that is tried on top of the given covariances, in units of their median variance."""
 
 SMALLEST_RAD = np.radians(0.01)
 
 
-def fit_noise(residuals: Array, candidates: list[Array]) -> tuple[Array, float]:
-    """Choose and scale covariances so that the residuals are most likely.
+def fit_noise(residuals: Array, given: Array) -> Array:
+    """Scale covariances, on top of an isotropic floor, so that the residuals are most likely.
 
-    Two-view covariances know nothing of wrong intrinsics or mismatches and are often too small. Every
-    candidate is tried with several isotropic floors, and scaled; with the largest floor all edges weigh the
-    same.
+    Two-view covariances know nothing of wrong intrinsics or mismatches and are often too small. Several
+    floors are tried; with the largest one all edges weigh the same.
 
     Parameters
     ----------
     residuals : (E,3) radians.
-    candidates : covariances (E,3,3), each up to one common factor.
+    given : (E,3,3) covariances up to a common factor.
 
     Returns
     -------
-    covariances : (E,3,3) rad^2.
-    likelihood : log-likelihood of the residuals under them.
+    (E,3,3) rad^2.
     """
-    best: tuple[Array, float] | None = None
-    for candidate in candidates:
-        unit = float(np.median(np.trace(candidate, axis1=1, axis2=2))) / 3.0
-        for floor in FLOORS:
-            shaped = candidate / unit + floor * np.eye(3)
-            squares = squared_lengths(residuals, np.linalg.inv(shaped))
-            scale = _scale(squares)
-            likelihood = float(
-                np.sum(
-                    -0.5 * np.linalg.slogdet(shaped * scale)[1]
-                    - 0.5 * (DEGREES_OF_FREEDOM + 3.0) * np.log1p(squares / scale / DEGREES_OF_FREEDOM)
-                )
-            )
-            if best is None or likelihood > best[1]:
-                best = shaped * scale, likelihood
-    if best is None:
-        raise ValueError("no candidate covariances")
+    unit = float(np.median(np.trace(given, axis1=1, axis2=2))) / 3.0
+    best, best_likelihood = given, -np.inf
+    for floor in FLOORS:
+        shaped = given / unit + floor * np.eye(3)
+        squares = squared_lengths(residuals, np.linalg.inv(shaped))
+        scale = _scale(squares)
+        tails = (DEGREES_OF_FREEDOM + 3.0) * np.log1p(squares / scale / DEGREES_OF_FREEDOM)
+        likelihood = -0.5 * float(np.sum(np.linalg.slogdet(shaped * scale)[1] + tails))
+        if likelihood > best_likelihood:
+            best, best_likelihood = shaped * scale, likelihood
     return best
+
+
+def fill_covariances(covariances: Array, weights: Array) -> Array:
+    """Covariances (E,3,3) whose unknown ones are isotropic and inverse to the ``weights`` (E,).
+
+    They are at the level of the known ones of the same weight; up to a common factor if none is known.
+    """
+    traces = np.trace(covariances, axis1=1, axis2=2)
+    known = np.isfinite(covariances).all(axis=(1, 2)) & (traces > 0)
+    level = float(np.median(traces[known] * weights[known])) / 3.0 if known.any() else 1.0
+    return np.where(known[:, None, None], covariances, level * np.eye(3) / weights[:, None, None])
 
 
 def squared_lengths(residuals: Array, information: Array) -> Array:

@@ -11,7 +11,7 @@ from snakesfm.geometry.rotations import log_so3
 from snakesfm.rotation_averaging.base import RotationAverager, RotationGraph, edge_residuals
 from snakesfm.rotation_averaging.irls import IrlsAverager
 from snakesfm.rotation_averaging.linear import apply_increments, solve_anisotropic, world_residuals
-from snakesfm.rotation_averaging.noise import fit_noise, squared_lengths, student_weights
+from snakesfm.rotation_averaging.noise import fill_covariances, fit_noise, squared_lengths, student_weights
 from snakesfm.rotation_averaging.rejection import residual_limit
 from snakesfm.rotation_averaging.reseat import reseat_nodes
 from snakesfm.rotation_averaging.tree import tree_rotations
@@ -35,7 +35,7 @@ class TwoStageAverager(RotationAverager):
     A confident outlier spoils a single pass with covariances; after the robust stage it is refused. That
     stage starts from two spanning trees, by inlier counts and by cycle messages, moves single nodes out of
     local minima and keeps the result of least robust cost. The covariances are rescaled and floored as the
-    residuals demand, or replaced by inlier counts where these explain the residuals better.
+    residuals demand; where there is none, the inlier count stands in.
 
     Parameters
     ----------
@@ -99,11 +99,9 @@ class TwoStageAverager(RotationAverager):
         fits = angles <= residual_limit(angles, self.smallest_limit_rad, self.largest_limit_rad)
         if np.count_nonzero(fits) < graph.node_count:
             return averaged
-        candidates = [np.eye(3) / graph.weights[fits, None, None]]
-        if np.isfinite(graph.covariances[fits]).all():
-            candidates.append(graph.covariances[fits])
+        given = fill_covariances(graph.covariances[fits], graph.weights[fits])
         information = np.tile(np.eye(3), (len(fits), 1, 1))
-        information[fits] = np.linalg.inv(fit_noise(local[fits], candidates)[0])
+        information[fits] = np.linalg.inv(fit_noise(local[fits], given))
         information[~fits] *= REFUSED * np.median(information[fits, 0, 0])
         for _ in range(self.iterations):
             residuals = world_residuals(graph.pairs, graph.rotations, averaged)

@@ -6,7 +6,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from snakesfm.tracks.canonical import canonical_keypoints
 from snakesfm.tracks.split import cycle_support, split_conflicts
 
 Array = NDArray[Any]
@@ -43,7 +42,8 @@ def build_tracks(
 
     Connected components of the match graph; those that see an image at two places are split at their
     weakest links (see :func:`snakesfm.tracks.split.split_conflicts`), a link's strength being the number
-    of 3-cycles that confirm it, then the number of matches of its pair.
+    of 3-cycles that confirm it, then the number of matches of its pair. SIFT gives one place once per
+    dominant orientation; such keypoints make tracks of their own unless a match joins them.
 
     Parameters
     ----------
@@ -60,13 +60,9 @@ def build_tracks(
     Tracks sorted by their first observation.
     """
     base = np.r_[0, np.cumsum([len(k) for k in keypoints])].astype(np.int64)
-    canonical = np.concatenate(
-        [canonical_keypoints(k) + start for k, start in zip(keypoints, base[:-1], strict=True)]
-        or [np.zeros(0, dtype=np.int64)]
-    )
     counts = np.diff(offsets)
     pair_of = np.repeat(np.arange(len(pairs)), counts)
-    links = np.stack([canonical[base[pairs[pair_of, side]] + matches[:, side]] for side in (0, 1)], axis=1)
+    links = np.stack([base[pairs[pair_of, side]] + matches[:, side] for side in (0, 1)], axis=1)
     _, kept = np.unique(links[:, 0] * np.int64(base[-1]) + links[:, 1], return_index=True)
     links, weights = links[kept], counts[pair_of[kept]]
 

@@ -131,7 +131,7 @@ class _Structure:
 
 
 def _structure(ray_column: Array, track_row: Array, ends: Array) -> _Structure:
-    """Rays of one landmark in pairs ``first <= second``, and the upper blocks that pairs and edges add to."""
+    """Rays of one landmark in pairs ``first <= second``, and the upper blocks that they and edges fill."""
     lengths = np.bincount(track_row)
     stops = np.cumsum(lengths)[track_row]
     per_ray = stops - np.arange(len(track_row))

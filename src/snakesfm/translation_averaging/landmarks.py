@@ -1,5 +1,6 @@
 """Landmarks of known cameras: which tracks to use, and where the landmarks are."""
 
+import math
 from typing import Any
 
 import numpy as np
@@ -38,9 +39,9 @@ def perpendicular(rays: Array) -> Array:
 
 def sum_by(values: Array, groups: Array, count: int) -> Array:
     """Sums (count, ...) of values (Q, ...) over the groups (Q) that they belong to."""
-    flat = values.reshape(len(values), -1)
+    flat = values.reshape(len(values), math.prod(values.shape[1:]))
     sums = [np.bincount(groups, weights=flat[:, k], minlength=count) for k in range(flat.shape[1])]
-    return np.stack(sums, axis=1).reshape(count, *values.shape[1:])
+    return np.stack(sums, axis=1, dtype=np.float64).reshape(count, *values.shape[1:])
 
 
 def intersect(origins: Array, rays: Array, groups: Array, count: int, rounds: int = 5) -> Array:

@@ -14,6 +14,7 @@ from snakesfm.translation_averaging.landmarks import sum_by
 from snakesfm.translation_averaging.problem import PositioningProblem
 
 Array = NDArray[Any]
+FIRST_SCALE = 16.0
 IRLS_ROUNDS = 12
 IRLS_TOLERANCE = 5e-3
 
@@ -56,28 +57,35 @@ def refine_directions(
     """Directions of the edges (E,3) from the rays that they share, and how many rays (E) agree.
 
     The pair's own direction was estimated with the pair's own rotation; given the averaged rotations the
-    epipolar constraint d . (v_i x v_j) = 0 is linear in d. Robust: Cauchy weights, started at the pair's
-    direction; that direction stays where fewer than eight rays agree.
+    epipolar constraint d . (v_i x v_j) = 0 is linear in d. Robust: Cauchy weights whose scale shrinks to
+    ``scale_rad``, started at the pair's direction, which stays where fewer than eight rays agree.
     """
     normals = np.cross(problem.rays[left], problem.rays[right])
     sines = np.linalg.norm(normals, axis=1)
     count = len(problem.pairs)
     directions = problem.directions.copy()
     usable = sines > 1e-3
-    for _ in range(rounds):
+    for step in range(rounds):
+        scale = scale_rad * max(FIRST_SCALE * 0.5**step, 1.0)
         miss = epipolar_rad(problem, directions, edges, left, right)
-        weights = usable / (1.0 + (miss / scale_rad) ** 2)
+        weights = usable / (1.0 + (miss / scale) ** 2)
         moments = sum_by(
             normals[:, :, None] * normals[:, None, :] * (weights / np.maximum(sines, 1e-3))[:, None, None],
             edges,
             count,
         )
-        agree = np.bincount(edges, weights=(miss < 2.0 * scale_rad) & usable, minlength=count)
+        agree = np.bincount(edges, weights=(miss < 2.0 * scale) & usable, minlength=count)
         enough = agree >= 8
         vectors = np.linalg.eigh(moments[enough])[1][:, :, 0]
         vectors *= np.where(np.sum(vectors * directions[enough], axis=1) < 0, -1.0, 1.0)[:, None]
         directions[enough] = vectors
-    return directions, agree
+    # The pair's own direction decides the sign unless most landmarks would then lie behind the cameras.
+    turned = directions[edges]
+    sides = [np.einsum("si,si->s", np.cross(turned, problem.rays[end]), normals) for end in (right, left)]
+    ahead = np.logical_and(sides[0] > 0, sides[1] > 0)
+    behind = np.logical_and(sides[0] < 0, sides[1] < 0)
+    votes = np.bincount(edges, weights=weights * (ahead * 1.0 - behind * 1.0), minlength=count)
+    return np.where((votes < 0)[:, None], -directions, directions), agree
 
 
 def epipolar_rad(

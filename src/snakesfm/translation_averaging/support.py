@@ -20,10 +20,11 @@ class SupportLimits:
 
     Parameters
     ----------
-    sigma_rad : standard deviation of a ray; rays count that are within four of them.
+    sigma_rad : standard deviation of a ray, or more if the scene's median residual is larger; rays count
+        that are within four of them.
     edge_rad : edges count whose direction is within this angle.
     min_support : rays that count; or a third as many edges, for a camera without that many rays.
-    min_ratio : share of the camera's rays, or of its edges, that count.
+    min_ratio : share of the camera's rays that count; half of it is asked of its edges.
     max_relative_sigma : standard deviation of the centre, landmarks and other cameras being fixed, over the
         median length of the rays that count.
     """
@@ -31,7 +32,7 @@ class SupportLimits:
     sigma_rad: float = math.radians(0.3)
     edge_rad: float = math.radians(5.0)
     min_support: int = 6
-    min_ratio: float = 0.25
+    min_ratio: float = 0.5
     max_relative_sigma: float = 0.1
 
 
@@ -40,12 +41,19 @@ def held_cameras(
 ) -> Array:
     """Mask (N) of the cameras whose centre enough rays, or enough edges, hold in place."""
     count = problem.image_count
+    angles = angles_rad(problem, centers, points)
+    known = np.isfinite(angles)
+    # Where the averaged rotations are poor everywhere, one camera must not be better than the rest.
+    sigma = (
+        max(limits.sigma_rad, 1.5 * float(np.median(angles[known]))) if known.any() else limits.sigma_rad
+    )
     by_rays = _held(
         problem.ray_images,
-        angles_rad(problem, centers, points) < 4.0 * limits.sigma_rad,
+        angles < 4.0 * sigma,
         points[problem.ray_tracks] - centers[problem.ray_images],
-        limits.sigma_rad,
+        sigma,
         limits.min_support,
+        limits.min_ratio,
         limits,
         count,
     )
@@ -58,6 +66,7 @@ def held_cameras(
         np.concatenate([vectors, -vectors]),
         limits.edge_rad / 4.0,
         max(2, (limits.min_support + 2) // 3),
+        limits.min_ratio / 2.0,
         limits,
         count,
     )
@@ -72,6 +81,7 @@ def _held(
     offsets: Array,
     sigma_rad: float,
     min_support: int,
+    min_ratio: float,
     limits: SupportLimits,
     count: int,
 ) -> Array:
@@ -88,7 +98,7 @@ def _held(
     some = support > 0
     typical[some] = lengths[order][(starts + support // 2)[some]]
     firm = information * (limits.max_relative_sigma * typical) ** 2 > 1.0
-    return np.asarray(firm & (support >= min_support) & (support >= limits.min_ratio * total))
+    return np.asarray(firm & (support >= min_support) & (support >= min_ratio * total))
 
 
 def attach_cameras(

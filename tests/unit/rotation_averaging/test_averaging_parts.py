@@ -8,7 +8,7 @@ from snakesfm.geometry.rotations import angle_of
 from snakesfm.rotation_averaging.base import RotationGraph, edge_residuals
 from snakesfm.rotation_averaging.irls import IrlsAverager
 from snakesfm.rotation_averaging.linear import solve_anisotropic, solve_isotropic
-from snakesfm.rotation_averaging.noise import fit_noise
+from snakesfm.rotation_averaging.noise import fill_covariances, fit_noise
 from snakesfm.rotation_averaging.rejection import residual_limit
 from snakesfm.rotation_averaging.reseat import reseat_nodes
 from snakesfm.rotation_averaging.tree import tree_rotations
@@ -71,8 +71,7 @@ def test_noise_model_finds_the_scale_of_overconfident_covariances():
     roots = np.radians(rng.uniform(0.1, 1.0, (3000, 1)))
     residuals = roots * rng.normal(size=(3000, 3))
     given = roots[..., None] ** 2 * np.eye(3) / 25.0
-    counts = np.tile(np.eye(3), (3000, 1, 1))
-    fitted, _ = fit_noise(residuals, [counts, given])
+    fitted = fit_noise(residuals, given)
     ratios = np.sqrt(fitted[:, 0, 0]) / roots[:, 0]
     # Student t on normal residuals: the scale is somewhat smaller than the deviation
     assert 0.6 < np.median(ratios) < 1.1
@@ -83,14 +82,23 @@ def test_noise_model_prefers_equal_weights_to_meaningless_covariances():
     rng = np.random.default_rng(5)
     residuals = np.radians(0.5) * rng.normal(size=(2000, 3))
     meaningless = np.exp(rng.normal(0, 2, (2000, 1, 1))) * np.eye(3)
-    fitted, _ = fit_noise(residuals, [meaningless])
+    fitted = fit_noise(residuals, meaningless)
     deviations = np.sqrt(fitted[:, 0, 0])
     assert np.percentile(deviations, 90) < 1.5 * np.percentile(deviations, 10)
 
 
 def test_noise_model_survives_zero_residuals():
-    fitted, likelihood = fit_noise(np.zeros((5, 3)), [np.tile(np.eye(3), (5, 1, 1))])
-    assert np.isfinite(fitted).all() and np.isfinite(likelihood)
+    assert np.isfinite(fit_noise(np.zeros((5, 3)), np.tile(np.eye(3), (5, 1, 1)))).all()
+
+
+def test_unknown_covariances_follow_the_weights():
+    covariances = np.tile(0.04 * np.eye(3), (3, 1, 1))
+    covariances[1] = np.nan
+    filled = fill_covariances(covariances, np.array([10.0, 40.0, 10.0]))
+    np.testing.assert_array_equal(filled[[0, 2]], covariances[[0, 2]])
+    np.testing.assert_allclose(filled[1], 0.01 * np.eye(3))
+    unknown = fill_covariances(np.full((2, 3, 3), np.nan), np.array([1.0, 4.0]))
+    np.testing.assert_allclose(unknown[0], 4.0 * unknown[1])
 
 
 def test_reseating_frees_a_stuck_node():

@@ -13,9 +13,10 @@ LAYOUTS = ["ring", "street", "area", "facade"]
 def test_exact_problem_reprojects_onto_its_keypoints(layout):
     problem = make_problem(20, 800, layout, noise_px=0.0, rotation_noise_deg=0.0)
     track_ids = np.repeat(np.arange(len(problem.points)), np.diff(problem.track_offsets))
-    rays = np.einsum(
-        "lij,lj->li", problem.rotations[problem.track_image_ids], problem.points[track_ids]
-    ) + problem.translations[problem.track_image_ids]
+    rays = (
+        np.einsum("lij,lj->li", problem.rotations[problem.track_image_ids], problem.points[track_ids])
+        + problem.translations[problem.track_image_ids]
+    )
     pixels = np.asarray(problem.cameras[0].to_pycolmap().img_from_cam(rays))
     assert np.all(rays[:, 2] > 0)
     assert np.abs(pixels - problem.track_keypoints).max() < 1e-3

@@ -5,7 +5,6 @@ import pytest
 
 from snakesfm.synthetic.problems import make_problem
 from snakesfm.tracks.build import build_tracks
-from snakesfm.tracks.canonical import canonical_keypoints
 from snakesfm.tracks.split import cycle_support, split_conflicts
 
 
@@ -61,9 +60,7 @@ def test_conflict_is_cut_at_the_unconfirmed_match():
 
 
 def test_conflict_is_dropped_whole_where_splitting_is_off():
-    tracks = build_tracks(
-        spread_keypoints(4, 2), *matches_of(two_tracks_with_a_wrong_link()), split=False
-    )
+    tracks = build_tracks(spread_keypoints(4, 2), *matches_of(two_tracks_with_a_wrong_link()), split=False)
     assert as_sets(tracks) == [] and tracks.conflicts == 1
 
 
@@ -84,15 +81,6 @@ def test_near_keypoints_of_one_image_are_one_observation():
     assert as_sets(build_tracks(keypoints, *matches_of(table), merge_radius_px=0.1)) != [
         [(0, 0), (1, 1), (2, 0)]
     ]
-
-
-def test_keypoints_at_one_place_are_one_node():
-    keypoints = spread_keypoints(3, 3)
-    keypoints[1][2] = keypoints[1][0]
-    table = {(0, 1): [(0, 0)], (1, 2): [(2, 0)]}
-    assert as_sets(build_tracks(keypoints, *matches_of(table))) == [[(0, 0), (1, 0), (2, 0)]]
-    np.testing.assert_array_equal(canonical_keypoints(keypoints[1]), [0, 1, 0])
-    assert len(canonical_keypoints(np.zeros((0, 2), np.float32))) == 0
 
 
 def test_cycle_support_counts_triangles():
@@ -129,7 +117,9 @@ def test_synthetic_scene_gives_true_tracks(outlier_ratio):
     shown = np.concatenate(problem.keypoint_points)
     base = np.r_[0, np.cumsum([len(k) for k in problem.keypoints])]
     points = shown[base[tracks.image_ids] + tracks.keypoint_ids]
-    pure = [len(np.unique(points[a:b])) == 1 for a, b in zip(tracks.offsets, tracks.offsets[1:], strict=False)]
+    pure = [
+        len(np.unique(points[a:b])) == 1 for a, b in zip(tracks.offsets, tracks.offsets[1:], strict=False)
+    ]
     for a, b in zip(tracks.offsets[:-1], tracks.offsets[1:], strict=True):
         assert np.all(np.diff(tracks.image_ids[a:b]) > 0)
     if outlier_ratio == 0:

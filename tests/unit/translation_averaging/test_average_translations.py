@@ -208,7 +208,9 @@ def test_gauge_and_frame():
     truth = make_problem(15, 700, "ring", noise_px=0.1)
     problem = positioning(truth)
     result = average_translations(problem, ScaleChain(), LIMITS)
-    lengths = np.linalg.norm(result.centers[problem.pairs[:, 1]] - result.centers[problem.pairs[:, 0]], axis=1)
+    lengths = np.linalg.norm(
+        result.centers[problem.pairs[:, 1]] - result.centers[problem.pairs[:, 0]], axis=1
+    )
     assert abs(np.median(lengths) - 1.0) < 1e-9
     assert np.abs(np.median(result.centers, axis=0)).max() < 1e-9
     moved = normalize_gauge(problem, 3.0 * result.centers + 5.0)

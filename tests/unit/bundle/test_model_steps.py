@@ -1,0 +1,253 @@
+"""The model to pycolmap and back, and what is done to it between rounds."""
+
+from dataclasses import replace
+
+import cv2  # noqa: F401
+import numpy as np
+import pycolmap
+import pytest
+
+from snakesfm.bundle.completion import TrackCompleter, correspondence_graph, drop_repeated_observations
+from snakesfm.bundle.filtering import (
+    deregister_weak_images,
+    drop_short_tracks,
+    filter_observations,
+    reset_wild_cameras,
+)
+from snakesfm.bundle.interface import SolverSettings
+from snakesfm.bundle.model import BundleModel, from_reconstruction, reprojection_errors, to_reconstruction
+from snakesfm.bundle.registration import register_left_out
+from snakesfm.bundle.rounds import RoundSettings, adjust_rounds
+from snakesfm.geometry.camera import Camera
+from snakesfm.geometry.poses import translation_of
+from snakesfm.geometry.rotations import angle_of
+from snakesfm.synthetic.problems import make_problem, perturb_rotations
+
+NAMES = [f"{k}.jpg" for k in range(12)]
+
+
+def problem(**changes):
+    return make_problem(12, 300, **{"noise_px": 0.3, "seed": 5, **changes})
+
+
+def model_of(made, left_out=(), keep=None):
+    """The true model, without the poses of ``left_out`` and with the observations ``keep`` only."""
+    rotations, translations = made.rotations.copy(), made.translations.copy()
+    rotations[list(left_out)] = np.nan
+    translations[list(left_out)] = np.nan
+    keep = np.ones(len(made.track_image_ids), bool) if keep is None else keep
+    track_of = np.repeat(np.arange(len(made.points)), np.diff(made.track_offsets))
+    lengths = np.bincount(track_of[keep], minlength=len(made.points))
+    return BundleModel(
+        made.cameras,
+        made.camera_ids,
+        rotations,
+        translations,
+        made.points,
+        np.r_[0, np.cumsum(lengths)],
+        made.track_image_ids[keep],
+        made.track_keypoint_ids[keep],
+    )
+
+
+def graph_of(made):
+    return correspondence_graph(made.keypoints, made.pairs, made.match_offsets, made.matches)
+
+
+def errors_px(model, made):
+    base = np.r_[0, np.cumsum([len(k) for k in made.keypoints])]
+    return reprojection_errors(
+        model, np.concatenate(made.keypoints)[base[model.image_ids] + model.keypoint_ids]
+    )
+
+
+def test_round_trip_keeps_everything_and_sorts():
+    made = problem()
+    model = model_of(made, left_out=[3])
+    result = from_reconstruction(to_reconstruction(model, made.keypoints, NAMES), model)
+    assert np.isnan(result.rotations[3]).all() and not (result.image_ids == 3).any()
+    posed = np.arange(12) != 3
+    np.testing.assert_allclose(result.rotations[posed], model.rotations[posed], atol=1e-12)
+    np.testing.assert_allclose(result.translations[posed], model.translations[posed], atol=1e-12)
+    assert result.offsets[-1] == len(result.image_ids)
+    first = list(
+        zip(result.image_ids[result.offsets[:-1]], result.keypoint_ids[result.offsets[:-1]], strict=True)
+    )
+    assert first == sorted(first)
+    for a, b in zip(result.offsets[:-1], result.offsets[1:], strict=True):
+        assert b - a >= 2 and np.all(np.diff(result.image_ids[a:b]) > 0)
+    assert 0.2 < errors_px(result, made).mean() < 0.6
+    again = from_reconstruction(to_reconstruction(result, made.keypoints, NAMES), result)
+    np.testing.assert_array_equal(again.points, result.points)
+    np.testing.assert_array_equal(again.keypoint_ids, result.keypoint_ids)
+
+
+def test_empty_model():
+    made = problem()
+    model = model_of(made, left_out=range(12))
+    result = from_reconstruction(to_reconstruction(model, made.keypoints, NAMES), model)
+    assert result.points.shape == (0, 3) and result.offsets.tolist() == [0]
+    assert errors_px(result, made).shape == (0,)
+
+
+def test_points_behind_the_camera_have_infinite_errors():
+    made = problem()
+    model = model_of(made)
+    assert np.isinf(errors_px(replace(model, translations=model.translations - [0, 0, 1e3]), made)).all()
+
+
+def test_filter_drops_observations_and_not_whole_tracks():
+    made = problem(outlier_ratio=0.05)
+    model = model_of(made)
+    reconstruction = to_reconstruction(model, made.keypoints, NAMES)
+    dropped = filter_observations(reconstruction, 4.0, 0.0)
+    result = from_reconstruction(reconstruction, model)
+    assert errors_px(result, made).max() <= 4.0
+    assert made.track_outliers.sum() * 0.9 < dropped < made.track_outliers.sum() * 1.6
+    filter_observations(reconstruction, 4.0, 0.0, 3)
+    assert np.diff(from_reconstruction(reconstruction, model).offsets).min() == 3
+    drop_short_tracks(reconstruction, 4)
+    assert np.diff(from_reconstruction(reconstruction, model).offsets).min() == 4
+
+
+def test_weak_images_are_taken_out():
+    made = problem()
+    few = np.ones(len(made.track_image_ids), bool)
+    few[np.nonzero(made.track_image_ids == 2)[0][5:]] = False
+    reconstruction = to_reconstruction(model_of(made, keep=few), made.keypoints, NAMES)
+    assert deregister_weak_images(reconstruction, 10) == [2]
+    assert sorted(reconstruction.reg_image_ids()) == [k + 1 for k in range(12) if k != 2]
+
+
+@pytest.mark.parametrize(
+    ("params", "wild"),
+    [
+        ((500.0, 320.0, 240.0, 0.1), []),
+        ((1600.0, 320.0, 240.0, 0.1), [0]),
+        ((500.0, 320.0, 240.0, -1.5), [0]),
+    ],
+)
+def test_wild_cameras_are_reset(params, wild):
+    made = problem()
+    start = Camera("SIMPLE_RADIAL", 640, 480, (500.0, 320.0, 240.0, 0.0))
+    model = replace(model_of(made), cameras=(replace(start, params=params),))
+    reconstruction = to_reconstruction(model, made.keypoints, NAMES)
+    assert reset_wild_cameras(reconstruction, [start], 3.0, 1.0) == wild
+    if wild:
+        assert tuple(reconstruction.camera(1).params) == start.params
+
+
+def test_completion_brings_observations_back():
+    made = problem()
+    rng = np.random.default_rng(0)
+    half = rng.random(len(made.track_image_ids)) < 0.5
+    model = model_of(made, keep=half)
+    reconstruction = to_reconstruction(model, made.keypoints, NAMES)
+    drop_short_tracks(reconstruction, 2)
+    before = reconstruction.compute_num_observations()
+    added = TrackCompleter(reconstruction, graph_of(made), 4.0, 1.0, 0)()
+    result = from_reconstruction(reconstruction, model)
+    assert added == len(result.image_ids) - before > 0.3 * len(half)
+    assert errors_px(result, made).max() < 6.0
+
+
+def test_an_image_observes_a_point_once():
+    made = problem()
+    model = model_of(made)
+    reconstruction = to_reconstruction(model, made.keypoints, NAMES)
+    point = min(reconstruction.point3D_ids())
+    image = reconstruction.point3D(point).track.elements[0].image_id
+    others = [
+        e for p in sorted(reconstruction.point3D_ids()) for e in reconstruction.point3D(p).track.elements
+    ]
+    row = next(e.point2D_idx for e in others[::-1] if e.image_id == image)
+    reconstruction.delete_observation(image, row)
+    before = reconstruction.compute_num_observations()
+    reconstruction.add_observation(point, pycolmap.TrackElement(image, row))
+    assert drop_repeated_observations(reconstruction) == 1
+    assert reconstruction.compute_num_observations() == before
+    assert drop_repeated_observations(reconstruction) == 0
+
+
+def test_left_out_image_is_registered_and_a_stranger_is_not():
+    made = problem()
+    reconstruction = to_reconstruction(model_of(made, left_out=[4, 7]), made.keypoints, NAMES)
+    strange = made.matches.copy()
+    rng = np.random.default_rng(0)
+    pair_of = np.repeat(np.arange(len(made.pairs)), np.diff(made.match_offsets))
+    for side in (0, 1):
+        rows = made.pairs[pair_of, side] == 7
+        strange[rows, side] = rng.integers(0, len(made.keypoints[7]), rows.sum())
+    graph = correspondence_graph(made.keypoints, made.pairs, made.match_offsets, strange)
+    assert register_left_out(reconstruction, graph, 6.0, 15, 0.25, 0) == [4]
+    pose = reconstruction.image(5).cam_from_world()
+    assert np.degrees(angle_of(pose.rotation.matrix().T @ made.rotations[4])) < 0.3
+    assert np.linalg.norm(pose.inverse().translation - made.centers[4]) < 0.05
+    assert reconstruction.image(5).num_points3D >= 15
+
+
+def perturbed(made, left_out=()):
+    model = model_of(made, left_out)
+    rng = np.random.default_rng(3)
+    centers = made.centers + rng.normal(0, 0.02, made.centers.shape)
+    rotations = perturb_rotations(model.rotations, 0.5, 1) if not left_out else model.rotations
+    return replace(
+        model,
+        rotations=rotations,
+        translations=np.where(
+            np.isnan(model.translations), np.nan, translation_of(np.nan_to_num(rotations), centers)
+        ),
+        points=made.points + rng.normal(0, 0.03, made.points.shape),
+    )
+
+
+def run_rounds(made, model, **changes):
+    reconstruction = to_reconstruction(model, made.keypoints, NAMES)
+    records = []
+    adjust_rounds(
+        reconstruction,
+        graph_of(made),
+        model.cameras,
+        SolverSettings(constant_cameras=frozenset([1])),
+        RoundSettings(**changes),
+        records.append,
+    )
+    return from_reconstruction(reconstruction, model), records
+
+
+def test_rounds_are_chained_and_recover_the_truth():
+    made = problem(outlier_ratio=0.05)
+    result, records = run_rounds(made, perturbed(made), rotations_first=True)
+    names = [record.name for record in records]
+    assert names == ["rotations fixed", "round 1", "round 2", "round 3"]
+    assert records[0].costs[0] > 5 * records[1].costs[1]
+    for record in records:
+        assert record.costs[1] <= record.costs[0]
+    errors = np.degrees(
+        angle_of(
+            np.einsum(
+                "nij,nkj->nik",
+                result.rotations @ result.rotations[0].T,
+                made.rotations @ made.rotations[0].T,
+            )[1:]
+        )
+    )
+    assert 1e-3 < errors.mean() < 0.3
+    assert 0.2 < errors_px(result, made).mean() < 0.6 and errors_px(result, made).max() <= 3.0
+    assert records[-1].counts == (12, len(result.points), len(result.image_ids))
+
+
+def test_left_out_images_get_a_last_round():
+    made = problem()
+    result, records = run_rounds(made, perturbed(made, left_out=[6]))
+    assert records[-1].name == "registration" and records[-1].counts[0] == 12
+    assert np.isfinite(result.rotations).all()
+    stays, _ = run_rounds(made, perturbed(made, left_out=[6]), register_images=False)
+    assert np.isnan(stays.rotations[6]).all()
+
+
+def test_rounds_are_deterministic():
+    made = problem(outlier_ratio=0.03)
+    first, second = (run_rounds(made, perturbed(made))[0] for _ in range(2))
+    np.testing.assert_array_equal(first.points, second.points)
+    np.testing.assert_array_equal(first.image_ids, second.image_ids)
