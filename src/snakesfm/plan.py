@@ -6,6 +6,7 @@ jobs is known before anything runs.
 
 import functools
 import json
+import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -61,8 +62,8 @@ class ScenePlan:
         if not images.is_dir():
             hint = "make it with 'make demo', or " if self.inputs.images == "demo/images" else ""
             raise ConfigError(
-                f"The image folder '{images}' does not exist: {hint}say which folder with "
-                "--config images=PATH."
+                f"The image folder '{images}' does not exist: {hint}say which folder with --config images=PATH "
+                "(name a path with ' #' in it in a file for --configfile: Snakemake cuts it there)."
             )
         if self.folder.resolve().is_relative_to(images.resolve()):
             raise ConfigError(
@@ -73,6 +74,10 @@ class ScenePlan:
             raise ConfigError(
                 f"The folder '{images}' holds no JPEG, PNG, TIFF, WebP or BMP image: "
                 "say with --config images=PATH which folder does."
+            )
+        if self.configuration.select_pairs.method == "listed" and not self.inputs.pairs:
+            raise ConfigError(
+                f"select_pairs.method is 'listed', but scene '{self.name}' has no list: give it with pairs=FILE."
             )
         for key in ("reference", "cameras", "pairs"):
             path = getattr(self.inputs, key)
@@ -184,6 +189,15 @@ class ScenePlan:
         return json.dumps(content, sort_keys=True)
 
 
+def _check_writable(folder: Path) -> None:
+    """Refuse an output folder that cannot be made or written, before Snakemake stumbles over it."""
+    existing = next(path for path in (folder, *folder.absolute().parents) if path.exists())
+    if not existing.is_dir() or not os.access(existing, os.W_OK | os.X_OK):
+        raise ConfigError(
+            f"The output folder '{folder}' cannot be written: say another with --config output=DIR."
+        )
+
+
 @functools.cache
 def _file_digest(path: str) -> str:
     """SHA-256 of a small file, or of the cameras, images and points files of a folder; '' for no path."""
@@ -205,6 +219,7 @@ class Plan:
     def __init__(self, config: Mapping[str, Any]) -> None:
         configuration = load_configuration(config)
         self.output = Path(configuration.output).expanduser()
+        _check_writable(self.output)
         self.scenes = {
             name: ScenePlan(name, inputs, configuration, self.output)
             for name, inputs in list_scenes(configuration).items()

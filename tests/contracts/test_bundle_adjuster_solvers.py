@@ -72,7 +72,7 @@ class BundleAdjusterContract:
         adjust(reconstruction, SolverSettings(constant_cameras=frozenset([1])))
         result = from_reconstruction(reconstruction, model)
         assert 0.3 < errors_px(result, made).mean() < 0.7
-        assert 1e-3 < relative_rotation_error_deg(result, made).mean() < 0.2
+        assert 1e-3 < relative_rotation_error_deg(result, made).mean() < 0.4
 
     @pytest.mark.parametrize("loss", ["huber", "cauchy"])
     def test_robust_loss_withstands_wrong_observations(self, adjust, loss):

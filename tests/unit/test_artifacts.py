@@ -1,6 +1,9 @@
 """Artifacts: round trips, checks of shape and dtype, and damaged files."""
 
 import dataclasses
+import os
+import subprocess
+import sys
 from pathlib import Path
 
 import h5py
@@ -110,6 +113,19 @@ def test_a_failing_writer_leaves_the_old_file_and_no_rest(tmp_path: Path) -> Non
         raise RuntimeError
     assert path.read_text() == "old"
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_what_a_killed_writer_left_is_removed_and_a_living_one_is_left_alone(tmp_path: Path) -> None:
+    path = tmp_path / "a.h5"
+    child = subprocess.Popen([sys.executable, "-c", "pass"])
+    child.wait()
+    dead = tmp_path / f".a.h5.{os.uname().nodename}.{child.pid}.x.tmp"
+    living = tmp_path / f".a.h5.{os.uname().nodename}.{os.getpid()}.x.tmp"
+    elsewhere = tmp_path / f".a.h5.other-host.{child.pid}.x.tmp"
+    for leftover in (dead, living, elsewhere):
+        leftover.write_text("half")
+    ImagePairs(pairs=[], reasons=[], similarities=[]).write(path, HEADER)
+    assert sorted(tmp_path.iterdir()) == sorted([living, elsewhere, path])
 
 
 @settings(max_examples=25, deadline=None)

@@ -171,14 +171,22 @@ def read_header(path: Path | str) -> Mapping[str, Any]:
 
 
 class atomic_path:  # noqa: N801 - used as a function, like contextlib's
-    """Context manager: yields a temporary path beside ``path`` and renames it on success."""
+    """Context manager: yields a temporary path beside ``path`` and renames it on success.
+
+    What writers that were killed on this machine left of the same file is removed.
+    """
 
     def __init__(self, path: Path) -> None:
         self.path = path
 
     def __enter__(self) -> Path:
         self.path.parent.mkdir(parents=True, exist_ok=True)
-        handle, name = tempfile.mkstemp(prefix=f".{self.path.name}.", dir=self.path.parent)
+        _remove_leftovers(self.path)
+        handle, name = tempfile.mkstemp(
+            prefix=f".{self.path.name}.{os.uname().nodename}.{os.getpid()}.",
+            suffix=".tmp",
+            dir=self.path.parent,
+        )
         os.close(handle)
         self.temporary = Path(name)
         self.temporary.chmod(0o666 & ~_umask())
@@ -191,6 +199,27 @@ class atomic_path:  # noqa: N801 - used as a function, like contextlib's
             self.temporary.replace(self.path)
         else:
             self.temporary.unlink(missing_ok=True)
+
+
+def _remove_leftovers(path: Path) -> None:
+    """Remove temporary files of ``path`` whose writer ran on this machine and is gone."""
+    host = os.uname().nodename
+    start = f".{path.name}.{host}."
+    for leftover in path.parent.iterdir():
+        if leftover.name.startswith(start) and leftover.name.endswith(".tmp"):
+            pid = leftover.name[len(start) :].split(".")[0]
+            if pid.isdigit() and not _is_alive(int(pid)):
+                leftover.unlink(missing_ok=True)
+
+
+def _is_alive(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:
+        return True
+    return True
 
 
 def _umask() -> int:

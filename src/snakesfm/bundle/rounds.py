@@ -32,6 +32,9 @@ class RoundSettings:
     solver: Literal["ceres", "gtsam"] = "ceres"
     thresholds_px: tuple[float, ...] = (10.0, 5.0, 3.0)
     rotations_first: bool = False
+    loss_scale_px: float | Literal["auto"] = "auto"
+    loss_scale_sigmas: float = 2.4
+    early_loss_share: float = 0.4
     max_focal_change: float = 3.0
     max_distortion: float = 1.0
     complete_tracks: bool = True
@@ -126,10 +129,17 @@ class _Mapper:
     def round(
         self, name: str, threshold_px: float, constant_rotations: bool = False, final: bool = False
     ) -> None:
-        """One pass of the solver and the filters after it; early passes need not converge."""
+        """One pass of the solver and the filters after it; early passes are coarse and less robust."""
         settings = self.settings
-        tolerance = self.solving.function_tolerance * (1.0 if final else EARLY_TOLERANCE)
-        solving = replace(self.solving, constant_rotations=constant_rotations, function_tolerance=tolerance)
+        solving = replace(
+            self.solving, constant_rotations=constant_rotations, loss_scale_px=self.loss_scale_px()
+        )
+        if not final:
+            solving = replace(
+                solving,
+                function_tolerance=solving.function_tolerance * EARLY_TOLERANCE,
+                loss_scale_px=settings.early_loss_share * threshold_px,
+            )
         drop_short_tracks(self.reconstruction, settings.min_track_length)
         costs = self.adjust(self.reconstruction, solving)
         wild = reset_wild_cameras(
@@ -158,6 +168,13 @@ class _Mapper:
         self.records.append(record)
         self.report(record)
 
+    def loss_scale_px(self) -> float:
+        """Where the loss of a final round sets in."""
+        settings = self.settings
+        if settings.loss_scale_px != "auto":
+            return settings.loss_scale_px
+        return settings.loss_scale_sigmas * keypoint_noise_px(self.reconstruction)
+
     def register(self) -> bool:
         """Register what can be; whether something was."""
         settings = self.settings
@@ -172,6 +189,21 @@ class _Mapper:
         if done:
             self.completer(done)
         return bool(done)
+
+
+def keypoint_noise_px(reconstruction: pycolmap.Reconstruction) -> float:
+    """Standard deviation per axis of the keypoints, from the reprojection errors of the model.
+
+    The median over the points withstands wrong observations. The mean length of an error is sqrt(pi/2) standard
+    deviations, and each point takes three of the two degrees of freedom per observation.
+    """
+    reconstruction.update_point_3d_errors()
+    points = reconstruction.points3D.values()
+    errors = np.array([point.error for point in points])
+    lengths = np.array([point.track.length() for point in points])
+    if not len(errors):
+        return 1.0
+    return float(np.median(errors / np.sqrt(np.pi / 2 * (1 - 1.5 / lengths))))
 
 
 def mean_point_errors(errors: Array, offsets: Array) -> Array:

@@ -18,8 +18,8 @@ class TriangulateTracksOptions(StageOptions):
     max_hypotheses: int = Field(default=100, ge=1, le=10_000)
     """Pairs of observations that are tried per track."""
 
-    max_reprojection_error_px: float = Field(default=20.0, gt=0.0)
-    """Observations farther from the projected point are dropped; averaged poses are not yet precise."""
+    max_reprojection_error_px: float = Field(default=60.0, gt=0.0)
+    """Observations farther from the projected point are dropped; wide, as averaged poses are rough."""
 
     min_angle_deg: float = Field(default=1.0, ge=0.0, lt=90.0)
     """Smallest angle between the rays to a point."""

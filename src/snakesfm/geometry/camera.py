@@ -2,12 +2,13 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import cv2  # noqa: F401 - must be loaded before pycolmap, whose PNG library clashes otherwise
 import numpy as np
-import pycolmap
 from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    import pycolmap
 
 Array = NDArray[Any]
 PARAM_SLOTS = 12
@@ -31,8 +32,10 @@ class Camera:
     params: tuple[float, ...]
     source: str = "given"
 
-    def to_pycolmap(self, camera_id: int = 1) -> pycolmap.Camera:
+    def to_pycolmap(self, camera_id: int = 1) -> "pycolmap.Camera":
         """The same camera for pycolmap."""
+        from snakesfm.geometry.colmap_binding import pycolmap
+
         return pycolmap.Camera(
             camera_id=camera_id,
             model=self.model,

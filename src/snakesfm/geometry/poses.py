@@ -1,11 +1,12 @@
 """Rigid poses as arrays, and the way to pycolmap's."""
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import cv2  # noqa: F401 - must be loaded before pycolmap, whose PNG library clashes otherwise
 import numpy as np
-import pycolmap
 from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    import pycolmap
 
 Array = NDArray[Any]
 
@@ -22,6 +23,8 @@ def translation_of(rotations: Array, centers: Array) -> Array:
     return translations
 
 
-def to_rigid3d(rotation: Array, translation: Array) -> pycolmap.Rigid3d:
+def to_rigid3d(rotation: Array, translation: Array) -> "pycolmap.Rigid3d":
     """One pose for pycolmap."""
+    from snakesfm.geometry.colmap_binding import pycolmap
+
     return pycolmap.Rigid3d(pycolmap.Rotation3d(np.asarray(rotation)), np.asarray(translation))

@@ -49,7 +49,6 @@ def run(job: StageJob) -> None:
     fixed = job.settings.get("intrinsics", "fixed") == "fixed"
     solving = SolverSettings(
         loss=options.loss,
-        loss_scale_px=options.loss_scale_px,
         constant_cameras=frozenset(
             row + 1 for row, camera in enumerate(cameras) if fixed and camera.source == "given"
         ),

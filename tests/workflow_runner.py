@@ -1,8 +1,9 @@
-"""A small rendered scene, and a way to run the workflow on it."""
+"""Runs the workflow as a user does, in a folder of the test's own."""
 
 import dataclasses
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -10,13 +11,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-import pytest
-
-from snakesfm.synthetic.render_demo import make_demo
-from snakesfm.synthetic.scene import DemoOptions
-
-ROOT = Path(__file__).resolve().parents[2]
-SMALL = DemoOptions(image_count=16, width=400, height=300)
+ROOT = Path(__file__).resolve().parents[1]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -79,24 +74,13 @@ class Workflow:
             process.wait(60)
 
 
-@pytest.fixture
-def workflow(tmp_path: Path) -> Workflow:
-    return Workflow(tmp_path)
+def copy_run(output: Path, folder: Path) -> None:
+    """Copy a finished run, with Snakemake's records, so that a test may disturb it."""
+    shutil.copytree(output.parent, folder / "out", symlinks=True)
+    shutil.copytree(output.parents[1] / ".snakemake", folder / ".snakemake", symlinks=True)
 
 
-@pytest.fixture(scope="session")
-def small_scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A rendered scene of 16 small images with its reference."""
-    folder = tmp_path_factory.mktemp("scene") / "square"
-    make_demo(folder, SMALL)
-    return folder
-
-
-@pytest.fixture(scope="session")
-def finished(small_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Outcome]:
-    """The small scene reconstructed once without disturbance: its output folder and what was printed."""
-    folder = tmp_path_factory.mktemp("finished")
-    config = [f"images={small_scene / 'images'}", f"reference={small_scene / 'reference'}", "output=out"]
-    outcome = Workflow(folder).run("--config", *config)
-    assert outcome.status == 0, outcome.text
-    return folder / "out" / "square", outcome
+def model_bytes(output: Path) -> dict[str, bytes]:
+    """The files of the exported model."""
+    folder = output / "export_model" / "sparse" / "0"
+    return {path.name: path.read_bytes() for path in sorted(folder.iterdir())}

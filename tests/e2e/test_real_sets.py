@@ -1,0 +1,62 @@
+"""Real photographs with ground truth, from images to evaluated model, as a user runs it."""
+
+import json
+from pathlib import Path
+
+import pytest
+from workflow_runner import Workflow
+
+pytestmark = pytest.mark.e2e
+
+# set, known intrinsics, least AUC at 1, 3 and 5 degrees
+KNOWN = [
+    ("strecha_fountain_p11", (94.0, 98.0, 98.8)),
+    ("strecha_entry_p10", (92.5, 97.4, 98.4)),
+    ("strecha_castle_p19", (90.0, 96.0, 98.0)),
+    ("imc_reichstag_10", (43.2, 78.5, 87.1)),
+]
+UNKNOWN = [("sceaux_castle_11", (85.0, 94.5, 96.5)), ("strecha_fountain_p11", (50.0, 82.0, 88.0))]
+
+
+def metrics_of(workflow: Workflow, folder: Path, *config: str) -> dict:
+    outcome = workflow.run(
+        "--config",
+        f"images={folder / 'images'}",
+        f"reference={folder / 'reference'}",
+        "output=out",
+        *config,
+    )
+    assert outcome.status == 0, outcome.text
+    return json.loads(
+        (workflow.folder / "out" / folder.name / "evaluate_model" / "metrics.json").read_text()
+    )
+
+
+def check(metrics: dict, least: tuple[float, float, float]) -> None:
+    assert metrics["reference_images_registered"] == metrics["reference_images"]
+    for degrees, bound in zip((1, 3, 5), least, strict=True):
+        assert bound <= metrics[f"relative_pose_auc_{degrees}deg"] < 99.9
+    assert 0.05 < metrics["reprojection_error_px_mean"] < 0.8
+    assert metrics["track_length_mean"] > 3.0
+
+
+@pytest.mark.parametrize(("name", "least"), KNOWN)
+def test_known_intrinsics(data: Path, workflow: Workflow, name: str, least: tuple) -> None:
+    folder = data / name
+    check(metrics_of(workflow, folder, f"cameras={folder / 'reference' / 'cameras.txt'}"), least)
+
+
+@pytest.mark.parametrize(("name", "least"), UNKNOWN)
+def test_unknown_intrinsics(data: Path, workflow: Workflow, name: str, least: tuple) -> None:
+    check(metrics_of(workflow, data / name), least)
+
+
+def test_retrieval_on_a_real_sequence(data: Path, workflow: Workflow) -> None:
+    folder = data / "strecha_castle_p19"
+    metrics = metrics_of(
+        workflow,
+        folder,
+        f"cameras={folder / 'reference' / 'cameras.txt'}",
+        "select_pairs={method: sequential+retrieval, look_ahead: 4, top_k: 4}",
+    )
+    check(metrics, (75.0, 90.0, 94.0))
