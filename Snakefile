@@ -7,7 +7,11 @@ from snakemake.utils import min_version
 min_version("9.27")
 
 
-configfile: workflow.basedir + "/config.yaml"
+configfile: f"{workflow.basedir}/config.yaml"
+
+
+# used with --software-deployment-method apptainer alone; built from workflow/envs/Dockerfile
+container: "docker://snakesfm/snakesfm:0.1.0"
 
 
 report: "workflow/report/workflow.rst"

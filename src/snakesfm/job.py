@@ -52,8 +52,7 @@ def _redirect_to_log(path: Path) -> Any:
 
 def _bind(stage: str, snakemake: Any, terminal: Any) -> Any:
     """The StageJob of a Snakemake job."""
-    from snakesfm.config.configuration import options_class
-    from snakesfm.stages.job import Progress, StageJob
+    from snakesfm.stages.job import JobOptions, Progress, StageJob
 
     content = json.loads(snakemake.params.job)
     outputs = tuple(Path(path) for path in snakemake.output)
@@ -67,7 +66,7 @@ def _bind(stage: str, snakemake: Any, terminal: Any) -> Any:
             for name, value in snakemake.input.items()
         },
         outputs=outputs,
-        options=options_class(stage)(**content["options"]),
+        options=JobOptions(content["options"], content["stage_version"]),
         settings=content["settings"],
         seed=content["seed"],
         threads=snakemake.threads,

@@ -24,7 +24,7 @@ def rule_texts(root: Path) -> dict[str, str]:
     rules = {}
     for file in sorted((root / "workflow" / "rules").glob("*.smk")):
         text = file.read_text()
-        for match in re.finditer(r"^( *)rule (?:(\w+))?:\n(.*?)(?=^\S|\Z)", text, re.M | re.S):
+        for match in re.finditer(r"^( *)rule ?(\w*):\n(.*?)(?=^\S|\Z)", text, re.M | re.S):
             script = re.search(r"scripts/(\w+)\.py", match[3])
             rules[match[2] or script[1]] = match[3]
     return rules

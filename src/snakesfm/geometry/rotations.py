@@ -1,6 +1,7 @@
 """Rotations as (..., 3, 3) matrices, vectorised.
 
-scipy is imported where it is needed: it is a third of the start-up of stages that only compare directions.
+Exponential and logarithm go by way of unit quaternions, which are exact near 0 and near pi. They are numpy's
+because scipy.spatial takes longer to load than most jobs to run.
 """
 
 from typing import Any
@@ -13,20 +14,46 @@ Array = NDArray[Any]
 
 def exp_so3(vectors: Array) -> Array:
     """Rotation vectors (..., 3) in radians to matrices (..., 3, 3)."""
-    from scipy.spatial.transform import Rotation
-
     vectors = np.asarray(vectors, dtype=np.float64)
-    flat = Rotation.from_rotvec(vectors.reshape(-1, 3)).as_matrix()
-    return flat.reshape(*vectors.shape[:-1], 3, 3)
+    halves = np.linalg.norm(vectors, axis=-1) / 2.0
+    x, y, z = np.moveaxis(vectors * (np.sinc(halves / np.pi) / 2.0)[..., None], -1, 0)
+    w = np.cos(halves)
+    rows = [
+        [x * x - y * y - z * z + w * w, 2.0 * (x * y - z * w), 2.0 * (x * z + y * w)],
+        [2.0 * (x * y + z * w), y * y - x * x - z * z + w * w, 2.0 * (y * z - x * w)],
+        [2.0 * (x * z - y * w), 2.0 * (y * z + x * w), z * z - x * x - y * y + w * w],
+    ]
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
 def log_so3(rotations: Array) -> Array:
-    """Matrices (..., 3, 3) to rotation vectors (..., 3) in radians."""
-    from scipy.spatial.transform import Rotation
+    """Rotation matrices (..., 3, 3) to rotation vectors (..., 3) in radians, at most pi long."""
+    quaternions = _quaternions(np.asarray(rotations, dtype=np.float64))
+    vectors, w = quaternions[..., :3], quaternions[..., 3]
+    vectors = np.where(w[..., None] < 0.0, -vectors, vectors)
+    sines = np.linalg.norm(vectors, axis=-1)
+    angles = 2.0 * np.arctan2(sines, np.abs(w))
+    scales = np.divide(angles, sines, out=np.full_like(sines, 2.0), where=sines > 0.0)
+    return np.asarray(vectors * scales[..., None])
 
-    rotations = np.asarray(rotations, dtype=np.float64)
-    flat = Rotation.from_matrix(rotations.reshape(-1, 3, 3)).as_rotvec()
-    return flat.reshape(*rotations.shape[:-2], 3)
+
+def _quaternions(rotations: Array) -> Array:
+    """Unit quaternions (..., 4) as x, y, z, w, of either sign (Markley, JGCD 2008)."""
+    m = np.moveaxis(rotations, (-2, -1), (0, 1))
+    xx, yy, zz = m[0, 0], m[1, 1], m[2, 2]
+    xy, xz, yz = m[0, 1] + m[1, 0], m[0, 2] + m[2, 0], m[1, 2] + m[2, 1]
+    xw, yw, zw = m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]
+    # 4 q q^T, of which the row with the largest diagonal element loses no digits
+    rows = [
+        [1.0 + xx - yy - zz, xy, xz, xw],
+        [xy, 1.0 - xx + yy - zz, yz, yw],
+        [xz, yz, 1.0 - xx - yy + zz, zw],
+        [xw, yw, zw, 1.0 + xx + yy + zz],
+    ]
+    outer = np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+    best = np.argmax(np.diagonal(outer, axis1=-2, axis2=-1), axis=-1)
+    chosen = np.take_along_axis(outer, best[..., None, None], axis=-2)[..., 0, :]
+    return np.asarray(chosen / np.linalg.norm(chosen, axis=-1, keepdims=True))
 
 
 def angle_of(rotations: Array) -> Array:

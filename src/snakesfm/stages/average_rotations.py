@@ -1,19 +1,22 @@
 """Average the relative rotations of the kept edges to one rotation per image."""
 
 import sys
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from snakesfm.artifacts.images import ImageIndex
 from snakesfm.artifacts.mapping import CameraRotations
 from snakesfm.artifacts.pairs import EDGE_LABELS, ViewGraph
-from snakesfm.config.average_rotations import AverageRotationsOptions
 from snakesfm.errors import SceneError
 from snakesfm.rotation_averaging.base import edge_residuals
 from snakesfm.rotation_averaging.registry import make_averager
 from snakesfm.rotation_averaging.rejection import residual_limit
 from snakesfm.stages.job import StageJob
 from snakesfm.view_graph.filters import keep_largest_component
+
+if TYPE_CHECKING:
+    from snakesfm.config.average_rotations import AverageRotationsOptions
 
 
 def run(job: StageJob) -> None:

@@ -1,12 +1,13 @@
 """Stage average_translations: camera centres from averaged rotations, the view graph and the tracks."""
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from snakesfm.artifacts.base import Array
 from snakesfm.artifacts.images import CalibratedCameras, ImageIndex
 from snakesfm.artifacts.mapping import CameraCenters, CameraRotations, TrackTable
 from snakesfm.artifacts.pairs import KINDS, ViewGraph
-from snakesfm.config.average_translations import AverageTranslationsOptions
 from snakesfm.errors import SceneError
 from snakesfm.geometry.camera import cameras_from_columns
 from snakesfm.stages.job import StageJob
@@ -19,6 +20,9 @@ from snakesfm.translation_averaging.averagers import (
 )
 from snakesfm.translation_averaging.problem import PositioningProblem, edge_directions, world_rays
 from snakesfm.translation_averaging.support import SupportLimits
+
+if TYPE_CHECKING:
+    from snakesfm.config.average_translations import AverageTranslationsOptions
 
 
 def run(job: StageJob) -> None:
@@ -100,7 +104,7 @@ def run(job: StageJob) -> None:
     ).write(job.output, job.header)
 
 
-def _averager(options: AverageTranslationsOptions) -> TranslationAverager:
+def _averager(options: "AverageTranslationsOptions") -> TranslationAverager:
     if options.method == "translation_recovery":
         return TranslationRecovery(
             rays_per_camera=options.recovery_rays_per_camera,

@@ -1,15 +1,19 @@
 """Stage build_tracks: inlier matches of the kept edges to tracks."""
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from snakesfm.artifacts.gather import gather_image_columns, gather_inlier_matches
 from snakesfm.artifacts.images import ImageIndex
 from snakesfm.artifacts.mapping import CameraRotations, TrackTable
 from snakesfm.artifacts.pairs import ViewGraph
-from snakesfm.config.build_tracks import BuildTracksOptions
 from snakesfm.errors import SceneError
 from snakesfm.stages.job import StageJob
 from snakesfm.tracks.build import build_tracks
+
+if TYPE_CHECKING:
+    from snakesfm.config.build_tracks import BuildTracksOptions
 
 
 def run(job: StageJob) -> None:

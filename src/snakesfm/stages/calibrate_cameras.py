@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,9 +10,11 @@ from numpy.typing import NDArray
 from snakesfm.artifacts.features import LocalFeatures
 from snakesfm.artifacts.images import CalibratedCameras, ImageIndex
 from snakesfm.artifacts.pairs import PairMatches
-from snakesfm.config.calibrate_cameras import CalibrateCamerasOptions
 from snakesfm.geometry.camera import Camera, cameras_from_columns, cameras_to_columns
 from snakesfm.stages.job import StageJob
+
+if TYPE_CHECKING:
+    from snakesfm.config.calibrate_cameras import CalibrateCamerasOptions
 
 Array = NDArray[Any]
 GIVEN_SIGMA = 0.0
@@ -38,7 +40,7 @@ def run(job: StageJob) -> None:
 
 
 def _calibrate(
-    job: StageJob, index: ImageIndex, cameras: list[Camera], options: CalibrateCamerasOptions
+    job: StageJob, index: ImageIndex, cameras: list[Camera], options: "CalibrateCamerasOptions"
 ) -> tuple[list[Camera], Array, Array]:
     # not needed where all cameras are given
     from snakesfm.calibration.focal import MatchedPair, calibrate_focals, choose_pairs

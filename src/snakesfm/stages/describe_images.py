@@ -1,12 +1,16 @@
 """Sum up every image of one block in a global descriptor."""
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from snakesfm.artifacts.features import GlobalDescriptors, LocalFeatures, Vocabulary
-from snakesfm.config.describe_images import DescribeImagesOptions
 from snakesfm.retrieval.codebook import largest_rows
 from snakesfm.retrieval.vlad import describe_vlad
 from snakesfm.stages.job import StageJob
+
+if TYPE_CHECKING:
+    from snakesfm.config.describe_images import DescribeImagesOptions
 
 
 def run(job: StageJob) -> None:

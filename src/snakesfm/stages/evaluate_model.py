@@ -1,12 +1,14 @@
 """evaluate_model: the model's metrics, against a reference where there is one."""
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from snakesfm.artifacts import ImageIndex, Reconstruction, atomic_path, write_json
-from snakesfm.config.evaluate_model import EvaluateModelOptions
 from snakesfm.evaluation.metrics import PoseEvaluation, Poses, evaluate_poses, model_metrics
 from snakesfm.stages.job import StageJob
+
+if TYPE_CHECKING:
+    from snakesfm.config.evaluate_model import EvaluateModelOptions
 
 
 def run(job: StageJob) -> None:

@@ -5,15 +5,18 @@ import shutil
 import sys
 import tempfile
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from snakesfm.artifacts import ImageIndex, Reconstruction
-from snakesfm.config.export_model import ExportModelOptions
 from snakesfm.export.colmap import build_reconstruction, registered_images, summarize
 from snakesfm.export.image_folder import place_images
 from snakesfm.export.nerfstudio import camera_warnings, transforms
 from snakesfm.export.undistorted import write_undistorted
 from snakesfm.geometry.camera import cameras_from_columns
 from snakesfm.stages.job import StageJob
+
+if TYPE_CHECKING:
+    from snakesfm.config.export_model import ExportModelOptions
 
 SUMMARY = "summary.json"
 UNDISTORTED = "undistorted"

@@ -4,7 +4,7 @@ import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
@@ -12,12 +12,14 @@ from numpy.typing import NDArray
 
 from snakesfm.artifacts.features import LocalFeatures
 from snakesfm.artifacts.images import ImageIndex
-from snakesfm.config.extract_features import ExtractFeaturesOptions
 from snakesfm.errors import ArtifactError, ImageError
 from snakesfm.features.extraction import create_detector, extract_keypoints, sample_colors
 from snakesfm.features.keypoints import Detector, KeypointSet
 from snakesfm.ingest.read import read_image
 from snakesfm.stages.job import StageJob
+
+if TYPE_CHECKING:
+    from snakesfm.config.extract_features import ExtractFeaturesOptions
 
 Array = NDArray[Any]
 
@@ -65,13 +67,13 @@ def run(job: StageJob) -> None:
     )
 
 
-def _digest(sha256: str, options: ExtractFeaturesOptions) -> str:
+def _digest(sha256: str, options: "ExtractFeaturesOptions") -> str:
     text = "\0".join((sha256, options.canonical_json(), str(options.stage_version)))
     return hashlib.sha256(text.encode()).hexdigest()
 
 
 def _extract(
-    folder: Path, name: str, detector: Detector, options: ExtractFeaturesOptions
+    folder: Path, name: str, detector: Detector, options: "ExtractFeaturesOptions"
 ) -> ColoredKeypoints:
     try:
         image = read_image(folder / name, options.max_shorter_side_px)

@@ -2,12 +2,12 @@
 
 import dataclasses
 import sys
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from snakesfm.artifacts.images import ImageIndex
 from snakesfm.artifacts.pairs import EDGE_LABELS, ViewGraph
-from snakesfm.config.filter_view_graph import FilterViewGraphOptions
 from snakesfm.stages.job import StageJob
 from snakesfm.view_graph.cycles import find_cycles, median_of
 from snakesfm.view_graph.filters import (
@@ -16,6 +16,9 @@ from snakesfm.view_graph.filters import (
     refuse_by_messages,
     vote_between_clusters,
 )
+
+if TYPE_CHECKING:
+    from snakesfm.config.filter_view_graph import FilterViewGraphOptions
 
 
 def run(job: StageJob) -> None:

@@ -1,5 +1,6 @@
 """What a stage gets to work with, wherever it runs."""
 
+import json
 import sys
 import time
 from collections.abc import Mapping
@@ -8,9 +9,33 @@ from pathlib import Path
 from typing import Any, TextIO
 
 from snakesfm.artifacts.base import Header
-from snakesfm.config.base import StageOptions
 from snakesfm.seeding import derive_seed
 
+
+class JobOptions:
+    """The options of a stage in a job: the attributes of the stage's options model, read-only.
+
+    They were validated when the Snakefile was parsed, so a job does without the models, whose library takes
+    longer to load than many jobs to run.
+
+    Parameters
+    ----------
+    values : the model's canonical JSON, parsed.
+    stage_version : the model's.
+    """
+
+    def __init__(self, values: Mapping[str, Any], stage_version: int) -> None:
+        for name, value in values.items():
+            self.__dict__[name] = tuple(value) if isinstance(value, list) else value
+        self.__dict__["stage_version"] = stage_version
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        raise AttributeError(f"options are read-only: {name} cannot be set")
+
+    def canonical_json(self) -> str:
+        """The same text as the model's ``canonical_json()``."""
+        values = {name: value for name, value in self.__dict__.items() if name != "stage_version"}
+        return json.dumps(values, sort_keys=True)
 
 @dataclass(frozen=True)
 class StageJob:
@@ -22,7 +47,7 @@ class StageJob:
     scene : name of the scene.
     inputs : named inputs of the rule; a list where the rule gathers several files.
     outputs : all files of the rule; ``output`` is the first, and the only one of most stages.
-    options : the stage's options model.
+    options : the stage's options: JobOptions in a job; the stage's options model will do as well.
     settings : what is no option but changes the result, such as the image folder or the number of blocks.
     seed : the run's seed.
     threads : how many threads may be used; results never depend on it.
@@ -47,8 +72,7 @@ class StageJob:
     @property
     def header(self) -> Header:
         """The root attributes of the artifact that this job writes."""
-        options: StageOptions = self.options
-        return Header(self.stage, options.stage_version, self.scene, options.canonical_json())
+        return Header(self.stage, self.options.stage_version, self.scene, self.options.canonical_json())
 
     def path(self, name: str) -> Path:
         """The one file of a named input."""

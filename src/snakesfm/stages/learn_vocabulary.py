@@ -1,11 +1,15 @@
 """Learn the codebook of local descriptors on the scene."""
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from snakesfm.artifacts.features import LocalFeatures, Vocabulary
-from snakesfm.config.learn_vocabulary import LearnVocabularyOptions
 from snakesfm.retrieval.codebook import largest_rows, learn_codebook, sample_rows
 from snakesfm.stages.job import StageJob
+
+if TYPE_CHECKING:
+    from snakesfm.config.learn_vocabulary import LearnVocabularyOptions
 
 
 def run(job: StageJob) -> None:

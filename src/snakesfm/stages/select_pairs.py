@@ -1,17 +1,20 @@
 """Choose the pairs of images that are matched."""
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from snakesfm.artifacts.features import GlobalDescriptors
 from snakesfm.artifacts.images import ImageIndex
 from snakesfm.artifacts.pairs import ImagePairs
-from snakesfm.config.select_pairs import SelectPairsOptions
 from snakesfm.errors import ConfigError
 from snakesfm.retrieval.listed import listed_pairs
 from snakesfm.retrieval.pairs import PairTable, exhaustive_pairs, sequential_pairs, similar_pairs
 from snakesfm.stages.job import StageJob
+
+if TYPE_CHECKING:
+    from snakesfm.config.select_pairs import SelectPairsOptions
 
 
 def run(job: StageJob) -> None:
@@ -32,7 +35,7 @@ def run(job: StageJob) -> None:
     print(f"{len(table.pairs)} pairs of {len(index.names)} images ({options.method})")
 
 
-def _choose(job: StageJob, index: ImageIndex, options: SelectPairsOptions, pairs_file: str) -> PairTable:
+def _choose(job: StageJob, index: ImageIndex, options: "SelectPairsOptions", pairs_file: str) -> PairTable:
     names = [str(name) for name in index.names]
     if options.method == "listed":
         return _read_list(pairs_file, names, [str(name) for name in index.refused_names])
@@ -61,7 +64,7 @@ def _read_list(path: str, names: list[str], refused: list[str]) -> PairTable:
     return table
 
 
-def _retrieve(paths: list[Path], options: SelectPairsOptions) -> PairTable:
+def _retrieve(paths: list[Path], options: "SelectPairsOptions") -> PairTable:
     image_ids = []
     for path in paths:
         with GlobalDescriptors.open(path) as file:

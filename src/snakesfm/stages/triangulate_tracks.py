@@ -1,16 +1,20 @@
 """Stage triangulate_tracks: points from tracks and averaged poses."""
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from snakesfm.artifacts.images import CalibratedCameras, ImageIndex
 from snakesfm.artifacts.mapping import CameraCenters, CameraRotations, TrackTable, TriangulatedPoints
-from snakesfm.config.triangulate_tracks import TriangulateTracksOptions
 from snakesfm.errors import SceneError
 from snakesfm.geometry.camera import cameras_from_columns
 from snakesfm.geometry.poses import translation_of
 from snakesfm.stages.job import StageJob
 from snakesfm.triangulation.interface import TriangulationLimits
 from snakesfm.triangulation.tracks import mean_colors, triangulate_tracks
+
+if TYPE_CHECKING:
+    from snakesfm.config.triangulate_tracks import TriangulateTracksOptions
 
 
 def run(job: StageJob) -> None:
