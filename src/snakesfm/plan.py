@@ -62,8 +62,9 @@ class ScenePlan:
         if not images.is_dir():
             hint = "make it with 'make demo', or " if self.inputs.images == "demo/images" else ""
             raise ConfigError(
-                f"The image folder '{images}' does not exist: {hint}say which folder with --config images=PATH "
-                "(name a path with ' #' in it in a file for --configfile: Snakemake cuts it there)."
+                f"The image folder '{images}' does not exist: {hint}say which folder with "
+                "--config images=PATH (name a path with ' #' in it in a file for --configfile: "
+                "Snakemake cuts it there)."
             )
         if self.folder.resolve().is_relative_to(images.resolve()):
             raise ConfigError(
@@ -77,7 +78,8 @@ class ScenePlan:
             )
         if self.configuration.select_pairs.method == "listed" and not self.inputs.pairs:
             raise ConfigError(
-                f"select_pairs.method is 'listed', but scene '{self.name}' has no list: give it with pairs=FILE."
+                f"select_pairs.method is 'listed', but scene '{self.name}' has no list: "
+                "give it with pairs=FILE."
             )
         for key in ("reference", "cameras", "pairs"):
             path = getattr(self.inputs, key)

@@ -1,5 +1,6 @@
 """The start and the end of a run, as a person sees them."""
 
+import contextlib
 import fcntl
 import json
 import os
@@ -95,9 +96,14 @@ class Run:
             summary = json.loads(path.read_text("utf-8"))
         except (OSError, ValueError):
             return f"snakesfm: scene '{scene.name}': no model yet."
+        accuracy = ""
+        with contextlib.suppress(OSError, ValueError, KeyError):
+            metrics = json.loads((scene.folder / "evaluate_model" / "metrics.json").read_text("utf-8"))
+            areas = [f"{metrics[f'relative_pose_auc_{degrees}deg']:.1f}" for degrees in (1, 3, 5)]
+            accuracy = f", relative-pose AUC {'/'.join(areas)} at 1/3/5 deg"
         return (
             f"snakesfm: scene '{scene.name}': {summary['registered_images']} of {summary['images']} images "
             f"registered, {summary['points']} points, mean reprojection error "
-            f"{summary['mean_reprojection_error_px']:.3f} px, {time.time() - self.started:.0f} s; "
-            f"model in {path.parent / 'sparse' / '0'}"
+            f"{summary['mean_reprojection_error_px']:.3f} px{accuracy}, "
+            f"{time.time() - self.started:.0f} s; model in {path.parent / 'sparse' / '0'}"
         )

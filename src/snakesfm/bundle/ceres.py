@@ -5,6 +5,7 @@ import pycolmap
 
 from snakesfm.bundle.interface import SolverSettings
 
+INNER_TOLERANCE = 0.1
 LOSSES = {
     "huber": pycolmap.LossFunctionType.HUBER,
     "cauchy": pycolmap.LossFunctionType.CAUCHY,
@@ -46,4 +47,7 @@ def _options(settings: SolverSettings) -> pycolmap.BundleAdjustmentOptions:
     solver.max_num_iterations = settings.max_iterations
     solver.function_tolerance = settings.function_tolerance
     solver.num_threads = settings.threads
+    # a robust loss needs few iterations if points follow the cameras; Ceres ends this where it gains little
+    solver.use_inner_iterations = True
+    solver.inner_iteration_tolerance = INNER_TOLERANCE
     return options

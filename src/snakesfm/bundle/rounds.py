@@ -22,7 +22,7 @@ from snakesfm.geometry.camera import Camera
 
 Array = NDArray[Any]
 
-EARLY_TOLERANCE = 10.0
+EARLY_TOLERANCE = 300.0
 
 
 @dataclass(frozen=True)
@@ -194,8 +194,8 @@ class _Mapper:
 def keypoint_noise_px(reconstruction: pycolmap.Reconstruction) -> float:
     """Standard deviation per axis of the keypoints, from the reprojection errors of the model.
 
-    The median over the points withstands wrong observations. The mean length of an error is sqrt(pi/2) standard
-    deviations, and each point takes three of the two degrees of freedom per observation.
+    The median over the points withstands wrong observations. The mean length of an error is sqrt(pi/2)
+    standard deviations, and each point takes three of the two degrees of freedom per observation.
     """
     reconstruction.update_point_3d_errors()
     points = reconstruction.points3D.values()

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,8 +11,10 @@ from snakesfm.calibration.adjustment import FocalAdjustment, adjust_focals
 from snakesfm.calibration.epipolar import EpipolarPair, estimate_epipolar_pair
 from snakesfm.calibration.profiles import scan_focals
 from snakesfm.calibration.votes import vote_focals
-from snakesfm.config.calibrate_cameras import CalibrateCamerasOptions
 from snakesfm.geometry.camera import Camera
+
+if TYPE_CHECKING:
+    from snakesfm.config.calibrate_cameras import CalibrateCamerasOptions
 
 Array = NDArray[Any]
 GIVEN = "given"
@@ -85,7 +87,7 @@ def choose_pairs(
 
 
 def calibrate_focals(
-    pairs: Sequence[MatchedPair], cameras: Sequence[Camera], options: CalibrateCamerasOptions
+    pairs: Sequence[MatchedPair], cameras: Sequence[Camera], options: "CalibrateCamerasOptions"
 ) -> CalibratedFocals:
     """Estimate the focal length of every camera that is not given.
 
@@ -107,7 +109,7 @@ def _epipolar_pairs(
     pairs: Sequence[MatchedPair],
     cameras: Sequence[Camera],
     prior: Array,
-    options: CalibrateCamerasOptions,
+    options: "CalibrateCamerasOptions",
 ) -> list[EpipolarPair]:
     found = (
         estimate_epipolar_pair(
@@ -130,7 +132,7 @@ def _adjust(
     free: Array,
     low: Array,
     high: Array,
-    options: CalibrateCamerasOptions,
+    options: "CalibrateCamerasOptions",
 ) -> FocalAdjustment:
     # the prior only keeps focal lengths that no pair tells in their place
     weak = np.full(len(prior), options.default_sigma)
@@ -149,7 +151,7 @@ def _believe(
     low: Array,
     high: Array,
     adjustment: FocalAdjustment,
-    options: CalibrateCamerasOptions,
+    options: "CalibrateCamerasOptions",
 ) -> CalibratedFocals:
     """Join estimates with EXIF where both agree; believe the matches where not, if they are certain."""
     believed = list(cameras)

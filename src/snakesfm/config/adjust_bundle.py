@@ -10,7 +10,7 @@ from snakesfm.config.base import StageOptions
 class AdjustBundleOptions(StageOptions):
     """How cameras, poses and points are adjusted together."""
 
-    stage_version: ClassVar[int] = 1
+    stage_version: ClassVar[int] = 2
 
     solver: Literal["ceres", "gtsam"] = "ceres"
     """Least-squares solver: Ceres through pycolmap, or gtsam (slower, fewer camera models)."""
@@ -75,5 +75,5 @@ class AdjustBundleOptions(StageOptions):
     max_iterations: int = Field(default=100, ge=1)
     """Iterations of the solver per pass."""
 
-    function_tolerance: float = Field(default=1e-5, gt=0.0)
-    """Relative decrease of the cost at which the last pass ends; earlier ones end at ten times as much."""
+    function_tolerance: float = Field(default=3e-6, gt=0.0)
+    """Relative decrease of the cost at which the last pass ends; earlier ones end at 300 times as much."""

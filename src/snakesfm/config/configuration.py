@@ -1,6 +1,7 @@
 """The whole configuration: what config.yaml and ``--config`` may hold."""
 
 import difflib
+import functools
 import importlib
 import re
 from collections.abc import Mapping
@@ -106,6 +107,7 @@ class RunOptions(BaseModel):
         return self
 
 
+@functools.cache
 def configuration_class() -> type[RunOptions]:
     """The model of the whole configuration: RunOptions and one block of options per stage."""
     fields: dict[str, Any] = {

@@ -2,12 +2,11 @@
 
 from pathlib import Path
 
-import cv2  # noqa: F401 - must be loaded before pycolmap, whose PNG library clashes otherwise
 import numpy as np
-import pycolmap
 
 from snakesfm.errors import ConfigError
 from snakesfm.evaluation.metrics import Poses
+from snakesfm.geometry.colmap_binding import pycolmap
 
 SUFFIXES = (".bin", ".txt")
 PLACES = (".", "sparse/0", "sparse", "0")

@@ -4,10 +4,10 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-import pycolmap
 from numpy.typing import NDArray
 
 from snakesfm.geometry.camera import Camera
+from snakesfm.geometry.colmap_binding import pycolmap
 from snakesfm.geometry.poses import to_rigid3d
 
 Array = NDArray[Any]

@@ -3,7 +3,7 @@
 import shutil
 from pathlib import Path
 
-import pycolmap
+from snakesfm.geometry.colmap_binding import pycolmap
 
 
 def write_undistorted(target: Path, sparse: Path, images: Path, threads: int) -> None:

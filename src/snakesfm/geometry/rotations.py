@@ -1,7 +1,7 @@
 """Rotations as (..., 3, 3) matrices, vectorised.
 
-Exponential and logarithm go by way of unit quaternions, which are exact near 0 and near pi. They are numpy's
-because scipy.spatial takes longer to load than most jobs to run.
+Exponential and logarithm are plain numpy because scipy.spatial takes longer to load than most jobs to run;
+both are exact to rounding near 0 and near pi too.
 """
 
 from typing import Any
@@ -10,24 +10,30 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[Any]
+IDENTITY = np.eye(3)
+GENERATORS = np.array(
+    [[0, 0, 0, 0, 0, -1, 0, 1, 0], [0, 0, 1, 0, 0, 0, -1, 0, 0], [0, -1, 0, 1, 0, 0, 0, 0, 0]],
+    dtype=np.float64,
+)
+"""The matrices of the cross products with x, y and z, one a row."""
 
 
 def exp_so3(vectors: Array) -> Array:
-    """Rotation vectors (..., 3) in radians to matrices (..., 3, 3)."""
+    """Rotation vectors (..., 3) in radians to matrices (..., 3, 3), by Rodrigues' formula."""
     vectors = np.asarray(vectors, dtype=np.float64)
-    halves = np.linalg.norm(vectors, axis=-1) / 2.0
-    x, y, z = np.moveaxis(vectors * (np.sinc(halves / np.pi) / 2.0)[..., None], -1, 0)
-    w = np.cos(halves)
-    rows = [
-        [x * x - y * y - z * z + w * w, 2.0 * (x * y - z * w), 2.0 * (x * z + y * w)],
-        [2.0 * (x * y + z * w), y * y - x * x - z * z + w * w, 2.0 * (y * z - x * w)],
-        [2.0 * (x * z - y * w), 2.0 * (y * z + x * w), z * z - x * x - y * y + w * w],
-    ]
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+    halves = np.sqrt(np.einsum("...i,...i->...", vectors, vectors))[..., None, None] / 2.0
+    sincs = np.divide(np.sin(halves), halves, out=np.ones_like(halves), where=halves > 0.0)
+    cosines = np.cos(halves)
+    skew = (vectors @ GENERATORS).reshape(*vectors.shape, 3)
+    outer = vectors[..., :, None] * vectors[..., None, :]
+    matrices: Array = (
+        (2.0 * cosines**2 - 1.0) * IDENTITY + (sincs * cosines) * skew + (sincs**2 / 2.0) * outer
+    )
+    return matrices
 
 
 def log_so3(rotations: Array) -> Array:
-    """Rotation matrices (..., 3, 3) to rotation vectors (..., 3) in radians, at most pi long."""
+    """Matrices (..., 3, 3) to rotation vectors (..., 3) in radians, at most pi long."""
     quaternions = _quaternions(np.asarray(rotations, dtype=np.float64))
     vectors, w = quaternions[..., :3], quaternions[..., 3]
     vectors = np.where(w[..., None] < 0.0, -vectors, vectors)

@@ -7,10 +7,10 @@ from pathlib import PurePosixPath
 from typing import Any, Literal
 
 import numpy as np
-import pycolmap
 from numpy.typing import NDArray
 
 from snakesfm.geometry.camera import Camera
+from snakesfm.geometry.colmap_binding import pycolmap
 from snakesfm.ingest.exif import Exif, focal_from_exif, is_cropped
 
 Array = NDArray[Any]

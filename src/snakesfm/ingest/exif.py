@@ -105,9 +105,9 @@ def sensor_width_mm(make: str, model: str) -> float:
     """Sensor width of a camera from COLMAP's database; NaN where it is unknown."""
     if not (make and model):
         return math.nan
-    import cv2  # noqa: F401 - before pycolmap, whose PNG library clashes otherwise
-    import pycolmap
     from PIL.TiffImagePlugin import IFDRational
+
+    from snakesfm.geometry.colmap_binding import pycolmap
 
     # pycolmap answers only for image files, so it is shown a small one that this camera might have taken
     probe = Image.new("RGB", (64, 48))

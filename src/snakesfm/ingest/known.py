@@ -6,10 +6,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-import pycolmap
 
 from snakesfm.errors import ConfigError
 from snakesfm.geometry.camera import Camera
+from snakesfm.geometry.colmap_binding import pycolmap
 
 FILE_NAMES = ("cameras.bin", "cameras.txt", "K.txt")
 # images.bin: quaternion and translation between image id and camera id

@@ -2,12 +2,13 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Literal, Protocol
 
 from numpy.typing import NDArray
 
 from snakesfm.features.keypoints import KeypointSet
-from snakesfm.matching.nearest import match_mutual_ratio
+from snakesfm.matching.clustered import ClusteredSearch
+from snakesfm.matching.nearest import ExactSearch
 
 Array = NDArray[Any]
 
@@ -15,8 +16,11 @@ Array = NDArray[Any]
 class Matcher(Protocol):
     """Matches the keypoints of two images; a new one joins by an entry in ``MATCHERS``."""
 
-    def match(self, first: KeypointSet, second: KeypointSet) -> tuple[Array, Array]:
-        """Match two images.
+    def prepare(self, first: KeypointSet) -> Any:
+        """Do once what all pairs of the image ``first`` need; the result goes into :meth:`match`."""
+
+    def match(self, first: Any, second: KeypointSet) -> tuple[Array, Array]:
+        """Match two images, the first of them prepared.
 
         Returns
         -------
@@ -31,14 +35,25 @@ class MutualRatioMatcher:
 
     Parameters
     ----------
-    max_ratio : as in :func:`snakesfm.matching.nearest.match_mutual_ratio`.
+    max_ratio : as in :func:`snakesfm.matching.nearest.accept`.
+    search : compare all descriptors, or those of like words.
+    words, probes : as in :meth:`snakesfm.matching.clustered.ClusteredSearch.build`.
     """
 
     max_ratio: float = 0.8
+    search: Literal["clustered", "exact"] = "clustered"
+    words: int = 32
+    probes: float = 3.0
 
-    def match(self, first: KeypointSet, second: KeypointSet) -> tuple[Array, Array]:
+    def prepare(self, first: KeypointSet) -> ClusteredSearch | ExactSearch:
         """See :class:`Matcher`."""
-        return match_mutual_ratio(first.descriptors, second.descriptors, self.max_ratio)
+        if self.search == "exact":
+            return ExactSearch.build(first.descriptors)
+        return ClusteredSearch.build(first.descriptors, self.words, self.probes)
+
+    def match(self, first: ClusteredSearch | ExactSearch, second: KeypointSet) -> tuple[Array, Array]:
+        """See :class:`Matcher`."""
+        return first.match(second.descriptors, self.max_ratio)
 
 
 MATCHERS: dict[str, Callable[..., Matcher]] = {"mutual_ratio": MutualRatioMatcher}

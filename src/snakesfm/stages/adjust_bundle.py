@@ -1,5 +1,7 @@
 """Stage adjust_bundle: cameras, poses and points adjusted together."""
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from snakesfm.artifacts.gather import gather_image_columns, gather_inlier_matches
@@ -10,12 +12,14 @@ from snakesfm.bundle.completion import correspondence_graph
 from snakesfm.bundle.interface import SolverSettings
 from snakesfm.bundle.model import BundleModel, from_reconstruction, reprojection_errors, to_reconstruction
 from snakesfm.bundle.rounds import RoundRecord, RoundSettings, adjust_rounds, mean_point_errors
-from snakesfm.config.adjust_bundle import AdjustBundleOptions
 from snakesfm.errors import SceneError
 from snakesfm.geometry.camera import cameras_from_columns, cameras_to_columns
 from snakesfm.geometry.poses import translation_of
 from snakesfm.stages.job import StageJob
 from snakesfm.triangulation.tracks import mean_colors
+
+if TYPE_CHECKING:
+    from snakesfm.config.adjust_bundle import AdjustBundleOptions
 
 
 def run(job: StageJob) -> None:

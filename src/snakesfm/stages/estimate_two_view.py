@@ -5,7 +5,7 @@ import json
 from collections import Counter
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,11 +13,14 @@ from numpy.typing import NDArray
 from snakesfm.artifacts.features import LocalFeatures
 from snakesfm.artifacts.images import CalibratedCameras, ImageIndex
 from snakesfm.artifacts.pairs import KINDS, REJECTIONS, PairMatches, TwoViewGeometries
-from snakesfm.config.estimate_two_view import EstimateTwoViewOptions
 from snakesfm.errors import ArtifactError
 from snakesfm.geometry.camera import Camera, cameras_from_columns
 from snakesfm.stages.job import StageJob
+from snakesfm.two_view.correspondences import first_rows_at_place, unify_matches
 from snakesfm.two_view.estimate import TwoViewEstimate, estimate_two_view_geometry
+
+if TYPE_CHECKING:
+    from snakesfm.config.estimate_two_view import EstimateTwoViewOptions
 
 Array = NDArray[Any]
 Row = dict[str, Any]
@@ -31,6 +34,7 @@ def run(job: StageJob) -> None:
     of_camera = cameras_from_columns(cameras.models, cameras.sizes, cameras.params, cameras.sources)
     matches = PairMatches.read(job.path("matches"))
     keypoints, image_digests = _read_keypoints(job.paths("features"), set(matches.pairs.ravel().tolist()))
+    places = {image: first_rows_at_place(points) for image, points in keypoints.items()}
     former = _read_former(job.former)
     progress = job.progress(len(matches.pairs), "pairs")
     rows: list[Row] = []
@@ -42,7 +46,7 @@ def run(job: StageJob) -> None:
                     f"{job.path('matches')} names image {index.names[image]}, which no features file "
                     "holds: delete both and run again."
                 )
-        pair_matches = matches.matches[matches.offsets[k] : matches.offsets[k + 1]]
+        pair_matches = _best_first(matches, k)
         camera_i, camera_j = (of_camera[index.camera_ids[image]] for image in (i, j))
         seed = job.seed_for(str(index.names[i]), str(index.names[j]))
         digest = _digest(
@@ -51,7 +55,13 @@ def run(job: StageJob) -> None:
         row = former.get(digest)
         if row is None:
             estimate = estimate_two_view_geometry(
-                keypoints[i], keypoints[j], pair_matches, camera_i, camera_j, options, seed
+                keypoints[i],
+                keypoints[j],
+                unify_matches(places[i], places[j], pair_matches),
+                camera_i,
+                camera_j,
+                options,
+                seed,
             )
             row = _to_row(estimate)
         else:
@@ -77,11 +87,18 @@ def _read_keypoints(paths: Iterable[Path], images: set[int]) -> tuple[dict[int, 
     return keypoints, digests
 
 
+def _best_first(matches: PairMatches, pair: int) -> Array:
+    """The matches (M,2) of a pair by falling confidence; in their order where that is equal."""
+    rows = slice(matches.offsets[pair], matches.offsets[pair + 1])
+    ordered: Array = matches.matches[rows][np.argsort(-matches.scores[rows], kind="stable")]
+    return ordered
+
+
 def _digest(
     matches: Array,
     image_digests: tuple[str, str],
     cameras: tuple[Camera, Camera],
-    options: EstimateTwoViewOptions,
+    options: "EstimateTwoViewOptions",
     seed: int,
 ) -> str:
     """Digest of all that a pair's result depends on."""

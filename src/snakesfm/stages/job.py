@@ -3,7 +3,7 @@
 import json
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TextIO
@@ -24,6 +24,8 @@ class JobOptions:
     stage_version : the model's.
     """
 
+    stage_version: int
+
     def __init__(self, values: Mapping[str, Any], stage_version: int) -> None:
         for name, value in values.items():
             self.__dict__[name] = tuple(value) if isinstance(value, list) else value
@@ -32,10 +34,15 @@ class JobOptions:
     def __setattr__(self, name: str, value: Any) -> None:
         raise AttributeError(f"options are read-only: {name} cannot be set")
 
+    def model_dump(self, include: Collection[str] | None = None) -> dict[str, Any]:
+        """All options by name, or those in ``include``: the same as the model's ``model_dump()``."""
+        names = self.__dict__.keys() - {"stage_version"}
+        return {name: self.__dict__[name] for name in sorted(names) if include is None or name in include}
+
     def canonical_json(self) -> str:
         """The same text as the model's ``canonical_json()``."""
-        values = {name: value for name, value in self.__dict__.items() if name != "stage_version"}
-        return json.dumps(values, sort_keys=True)
+        return json.dumps(self.model_dump(), sort_keys=True)
+
 
 @dataclass(frozen=True)
 class StageJob:

@@ -4,18 +4,20 @@ import hashlib
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from snakesfm.artifacts.features import LocalFeatures
 from snakesfm.artifacts.pairs import ImagePairs, PairMatches
-from snakesfm.config.match_pairs import MatchPairsOptions
 from snakesfm.errors import ArtifactError
 from snakesfm.features.keypoints import KeypointSet
 from snakesfm.matching.matcher import create_matcher
 from snakesfm.stages.job import StageJob
+
+if TYPE_CHECKING:
+    from snakesfm.config.match_pairs import MatchPairsOptions
 
 Array = NDArray[Any]
 Matches = tuple[Array, Array]
@@ -28,7 +30,7 @@ def run(job: StageJob) -> None:
     """
     options: MatchPairsOptions = job.options
     pairs = ImagePairs.read(job.path("pairs")).pairs
-    matcher = create_matcher(options.method, max_ratio=options.max_ratio)
+    matcher = create_matcher(**options.model_dump())
     with ExitStack() as stack:
         features = FeatureFiles(job.paths("features"), stack)
         digests = [_digest(features.digests[i], features.digests[j], options) for i, j in pairs.tolist()]
@@ -40,7 +42,7 @@ def run(job: StageJob) -> None:
             result = former.get(digest)
             if result is None:
                 if first is None or i != held:
-                    held, first = i, features.read(i)
+                    held, first = i, matcher.prepare(features.read(i))
                 result = matcher.match(first, features.read(j))
             results.append(result)
             progress.step()
@@ -80,7 +82,7 @@ class FeatureFiles:
         return KeypointSet(*(file[column][part] for column in columns))
 
 
-def _digest(first: str, second: str, options: MatchPairsOptions) -> str:
+def _digest(first: str, second: str, options: "MatchPairsOptions") -> str:
     text = "\0".join((first, second, options.canonical_json(), str(options.stage_version)))
     return hashlib.sha256(text.encode()).hexdigest()
 

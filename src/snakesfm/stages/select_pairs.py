@@ -18,10 +18,13 @@ if TYPE_CHECKING:
 
 
 def run(job: StageJob) -> None:
-    """Choose pairs by the resolved method and write one ImagePairs per tile, empty ones included."""
+    """Choose pairs by the method, which is no longer 'auto', and write one ImagePairs per tile.
+
+    A tile without pairs gets an empty one.
+    """
     index = ImageIndex.read(job.path("index"))
     pairs_file = str(job.settings["pairs_file"])
-    options: SelectPairsOptions = job.options.resolve(len(index.names), pairs_file)
+    options: SelectPairsOptions = job.options
     table = _choose(job, index, options, pairs_file)
     blocks = np.sort(index.blocks[table.pairs], axis=1)
     for output in job.outputs:
@@ -44,7 +47,7 @@ def _choose(job: StageJob, index: ImageIndex, options: "SelectPairsOptions", pai
     table = PairTable.of(np.zeros((0, 2)), "sequential")
     if "sequential" in options.method:
         table = table.union(sequential_pairs(names, options.look_ahead))
-    if options.needs_descriptors:
+    if "retrieval" in options.method:
         table = table.union(_retrieve(job.paths("descriptors"), options))
     return table
 

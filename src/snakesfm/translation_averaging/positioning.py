@@ -2,11 +2,10 @@
 
 from typing import Any
 
-import cv2  # noqa: F401 - must be loaded before pycolmap, whose PNG library clashes otherwise
 import numpy as np
-import pycolmap
 from numpy.typing import NDArray
 
+from snakesfm.geometry.colmap_binding import pycolmap
 from snakesfm.translation_averaging.landmarks import intersect, sum_by
 from snakesfm.translation_averaging.problem import PositioningProblem
 

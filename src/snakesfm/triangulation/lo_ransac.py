@@ -3,11 +3,10 @@
 from itertools import pairwise
 from typing import Any
 
-import cv2  # noqa: F401 - must be loaded before pycolmap, whose PNG library clashes otherwise
 import numpy as np
-import pycolmap
 from numpy.typing import NDArray
 
+from snakesfm.geometry.colmap_binding import pycolmap
 from snakesfm.geometry.poses import to_rigid3d
 from snakesfm.triangulation.interface import TriangulationLimits, TriangulationProblem, check_points
 

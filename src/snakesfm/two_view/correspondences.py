@@ -22,14 +22,17 @@ def first_rows_at_place(keypoints: Array) -> Array:
     return first[inverse]
 
 
-def unify_matches(keypoints_i: Array, keypoints_j: Array, matches: Array) -> Array:
-    """Matches (M,2) between the first rows of each place, each once, in the order of their occurrence."""
+def unify_matches(places_i: Array, places_j: Array, matches: Array) -> Array:
+    """Matches (M,2) between the first rows of each place, each once, in the order of their occurrence.
+
+    Parameters
+    ----------
+    places_i, places_j : (N,) int64, :func:`first_rows_at_place` of each image's keypoints.
+    """
     if len(matches) == 0:
         return np.zeros((0, 2), dtype=np.int32)
-    places = np.column_stack(
-        [first_rows_at_place(keypoints_i)[matches[:, 0]], first_rows_at_place(keypoints_j)[matches[:, 1]]]
-    )
-    _, first = np.unique(places[:, 0] * len(keypoints_j) + places[:, 1], return_index=True)
+    places = np.column_stack([places_i[matches[:, 0]], places_j[matches[:, 1]]])
+    _, first = np.unique(places[:, 0] * len(places_j) + places[:, 1], return_index=True)
     return places[np.sort(first)].astype(np.int32)
 
 

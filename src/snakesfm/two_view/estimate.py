@@ -1,16 +1,15 @@
 """The two-view geometry of one pair of images."""
 
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from snakesfm.config.estimate_two_view import EstimateTwoViewOptions
 from snakesfm.geometry.camera import Camera
-from snakesfm.geometry.rotations import angle_between, angle_of
+from snakesfm.geometry.rotations import angle_between
 from snakesfm.two_view.bundle import inverse_depths
-from snakesfm.two_view.correspondences import correspond, one_to_one, unify_matches
+from snakesfm.two_view.correspondences import correspond, one_to_one
 from snakesfm.two_view.covariance import DIRECTION_UNKNOWN_VARIANCE
 from snakesfm.two_view.estimators import ESTIMATORS, RobustPose
 from snakesfm.two_view.kinds import fit_homography, fit_rotation, planar_twins, transfer_errors_px
@@ -18,16 +17,20 @@ from snakesfm.two_view.refinement import SIGMA_FLOOR_PX, RefinedPose, refine_pos
 from snakesfm.two_view.sampson import Correspondences, cauchy_cost, sampson_errors_px
 from snakesfm.two_view.significance import significance_of
 
+if TYPE_CHECKING:
+    from snakesfm.config.estimate_two_view import EstimateTwoViewOptions
+
 Array = NDArray[Any]
 THRESHOLD_SIGMAS = 3.0
 SELECTION_SIGMAS = 4.0
 REACH_FACTOR = 4.0
+HOPELESS_SHARE = 0.6
 TWIN_PLANE_RATIO = 0.4
 TWIN_START_RATIO = 0.5
 TWIN_INLIER_RATIO = 0.85
 TWIN_NOISE_FLOOR_PX = 0.1
-TWIN_ROTATION_RAD = float(np.radians(5.0))
-TWIN_DIRECTION_RAD = float(np.radians(15.0))
+TWIN_ROTATION_COS = float(np.cos(np.radians(5.0)))
+TWIN_DIRECTION_COS = float(np.cos(np.radians(15.0)))
 
 
 @dataclass(frozen=True)
@@ -70,7 +73,7 @@ def estimate_two_view_geometry(
     matches: Array,
     camera_i: Camera,
     camera_j: Camera,
-    options: EstimateTwoViewOptions,
+    options: "EstimateTwoViewOptions",
     seed: int,
 ) -> TwoViewEstimate:
     """Estimate, refine and judge the relative pose of two images.
@@ -78,10 +81,10 @@ def estimate_two_view_geometry(
     Parameters
     ----------
     keypoints_i, keypoints_j : (N,2) float32 in original pixels, all keypoints of each image.
-    matches : (M,2) int32, keypoint rows in image i and in image j.
+    matches : (M,2) int32, keypoint rows in image i and in image j, between distinct places
+        (``correspondences.unify_matches``), the most confident first.
     seed : the only source of randomness.
     """
-    matches = unify_matches(keypoints_i, keypoints_j, matches)
     points = correspond(keypoints_i, keypoints_j, matches, camera_i, camera_j)
     # strong distortion cannot be undone everywhere
     finite: Array = np.isfinite(np.hstack([points.rays_i, points.rays_j])).all(axis=1)
@@ -89,10 +92,12 @@ def estimate_two_view_geometry(
     if len(matches) < options.min_inliers:
         return _without_pose("too_few_matches", len(matches))
     extent = np.ptp(keypoints_j[matches[:, 1]], axis=0)
-    found = _estimate(points, extent, options, seed)
-    if found is None:
+    robust = ESTIMATORS[options.estimator](points, options.max_error_px, options.max_iterations, seed)
+    if robust is None:
         return _without_pose("estimation_failed", len(matches))
-    robust, refined, significance = found
+    if _is_hopeless(points, robust, options):
+        return _without_pose("too_few_inliers", len(matches))
+    robust, refined, significance = _estimate(points, extent, robust, options, seed)
     return _judge(points, matches, robust, refined, significance, options, seed)
 
 
@@ -112,28 +117,37 @@ def _without_pose(rejection: str, match_count: int) -> TwoViewEstimate:
     )
 
 
+def _is_hopeless(points: Correspondences, robust: RobustPose, options: "EstimateTwoViewOptions") -> bool:
+    """Whether so few matches are near a first pose that refining it would not make the pair acceptable."""
+    count = len(points)
+    needed = max(
+        options.min_inliers, options.min_inlier_ratio * count, (options.min_support * count) ** 0.5
+    )
+    errors = sampson_errors_px(points, robust.rotation, robust.translation)
+    return bool(np.count_nonzero(np.abs(errors) < options.inlier_error_px) < HOPELESS_SHARE * needed)
+
+
 def _estimate(
-    points: Correspondences, extent: Array, options: EstimateTwoViewOptions, seed: int
-) -> tuple[RobustPose, RefinedPose, float] | None:
+    points: Correspondences, extent: Array, robust: RobustPose, options: "EstimateTwoViewOptions", seed: int
+) -> tuple[RobustPose, RefinedPose, float]:
     """The best of a tight estimation and, where the matches are noisier, of one adapted to their noise."""
-    best = _estimate_within(points, extent, options.max_error_px, options, seed)
-    if not options.adapt_error:
-        return best
-    sigma = options.max_error_px if best is None else best[1].sigma_px
-    adapted = min(THRESHOLD_SIGMAS * sigma, options.max_adapted_error_px)
-    if adapted > 1.5 * options.max_error_px:
-        other = _estimate_within(points, extent, adapted, options, seed)
-        if other is not None and (best is None or other[2] > best[2]):
-            best = other
+    best = _refined(points, extent, robust, options.max_error_px, options)
+    adapted = min(THRESHOLD_SIGMAS * best[1].sigma_px, options.max_adapted_error_px)
+    if options.adapt_error and adapted > 1.5 * options.max_error_px:
+        other = ESTIMATORS[options.estimator](points, adapted, options.max_iterations, seed)
+        if other is not None:
+            best = max(best, _refined(points, extent, other, adapted, options), key=lambda found: found[2])
     return best
 
 
-def _estimate_within(
-    points: Correspondences, extent: Array, max_error_px: float, options: EstimateTwoViewOptions, seed: int
-) -> tuple[RobustPose, RefinedPose, float] | None:
-    robust = ESTIMATORS[options.estimator](points, max_error_px, options.max_iterations, seed)
-    if robust is None:
-        return None
+def _refined(
+    points: Correspondences,
+    extent: Array,
+    robust: RobustPose,
+    max_error_px: float,
+    options: "EstimateTwoViewOptions",
+) -> tuple[RobustPose, RefinedPose, float]:
+    """A robust pose, refined, and the significance of that."""
     refined = refine_pose(
         points,
         robust.rotation,
@@ -151,7 +165,7 @@ def _judge(
     robust: RobustPose,
     refined: RefinedPose,
     significance: float,
-    options: EstimateTwoViewOptions,
+    options: "EstimateTwoViewOptions",
     seed: int,
 ) -> TwoViewEstimate:
     selection_px = max(options.inlier_error_px, SELECTION_SIGMAS * refined.sigma_px)
@@ -187,7 +201,7 @@ def _judge(
         rotation=rotation,
         translation=refined.translation,
         covariance=covariance,
-        inliers=matches[rows],
+        inliers=matches[rows][np.lexsort(matches[rows].T[::-1])],
         kind=kind,
         rejection=rejection,
         match_count=len(matches),
@@ -216,9 +230,9 @@ def _agreeing(
 
 
 def _same_pose(refined: RefinedPose, pose: tuple[Array, Array]) -> bool:
-    rotation_rad = angle_of(pose[0] @ refined.rotation.T)
-    direction_rad = angle_between(pose[1], refined.translation)
-    return bool(rotation_rad < TWIN_ROTATION_RAD and direction_rad < TWIN_DIRECTION_RAD)
+    rotation_cos = 0.5 * (float(np.sum(pose[0] * refined.rotation)) - 1.0)
+    direction_cos = float(pose[1] @ refined.translation)
+    return rotation_cos > TWIN_ROTATION_COS and direction_cos > TWIN_DIRECTION_COS
 
 
 def _kind_of(
@@ -226,7 +240,7 @@ def _kind_of(
     refined: RefinedPose,
     angle_deg: float,
     selection_px: float,
-    options: EstimateTwoViewOptions,
+    options: "EstimateTwoViewOptions",
     seed: int,
 ) -> tuple[str, bool]:
     """The kind of the pair, and whether another pose explains its one plane as well."""
@@ -249,7 +263,7 @@ def _gap_to(
     refined: RefinedPose,
     twin: tuple[Array, Array],
     selection_px: float,
-    options: EstimateTwoViewOptions,
+    options: "EstimateTwoViewOptions",
 ) -> float:
     """Log-likelihood of the inliers lost by another pose; infinite if it is no rival."""
     scale = 2.0 * max(refined.sigma_px, TWIN_NOISE_FLOOR_PX)

@@ -6,7 +6,6 @@ from typing import Any, Protocol
 import cv2
 import numpy as np
 import poselib
-import pycolmap
 from numpy.typing import NDArray
 
 from snakesfm.two_view.sampson import Correspondences
@@ -26,7 +25,10 @@ class RobustPose:
 
 
 class PoseEstimator(Protocol):
-    """Estimates a relative pose from correspondences with outliers; the same seed gives the same result."""
+    """Estimates a relative pose from correspondences with outliers; the same seed gives the same result.
+
+    The correspondences come best first: an estimator may draw from the first ones sooner.
+    """
 
     def __call__(
         self, points: Correspondences, max_error_px: float, max_iterations: int, seed: int
@@ -53,7 +55,10 @@ def poselib_camera(focal_px: float) -> dict[str, Any]:
 def estimate_poselib(
     points: Correspondences, max_error_px: float, max_iterations: int, seed: int
 ) -> RobustPose | None:
-    """LO-MSAC with a five-point solver and refinement of the Sampson error (PoseLib)."""
+    """LO-MSAC with a five-point solver, progressive sampling and refinement of the Sampson error (PoseLib).
+
+    Source: Chum and Matas, Matching with PROSAC, CVPR 2005.
+    """
     if len(points) < MINIMAL_SAMPLE:
         return None
     focal = points.mean_focal
@@ -65,9 +70,11 @@ def estimate_poselib(
         camera,
         {
             "max_epipolar_error": max_error_px,
-            "min_iterations": min(100, max_iterations),
+            "min_iterations": min(20, max_iterations),
             "max_iterations": max_iterations,
+            "dyn_num_trials_mult": 1.0,
             "success_prob": CONFIDENCE,
+            "progressive_sampling": True,
             "seed": seed,
         },
         {"loss_type": "CAUCHY", "loss_scale": 0.5 * max_error_px},
@@ -129,6 +136,8 @@ def estimate_pycolmap(
     if len(points) < MINIMAL_SAMPLE:
         return None
     focal = points.mean_focal
+    from snakesfm.geometry.colmap_binding import pycolmap
+
     camera = pycolmap.Camera(model="SIMPLE_PINHOLE", width=1, height=1, params=[focal, 0.0, 0.0])
     options = pycolmap.RANSACOptions()
     options.max_error = max_error_px

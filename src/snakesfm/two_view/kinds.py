@@ -27,7 +27,13 @@ def fit_homography(points: Correspondences, max_error_px: float, seed: int) -> t
     H, info = poselib.estimate_homography(
         points.rays_i[:, :2] * points.focal_i,
         points.rays_j[:, :2] * points.focal_j,
-        {"max_reproj_error": max_error_px, "min_iterations": 20, "max_iterations": 200, "seed": seed},
+        {
+            "max_reproj_error": max_error_px,
+            "min_iterations": 20,
+            "max_iterations": 100,
+            "dyn_num_trials_mult": 1.0,
+            "seed": seed,
+        },
         {},
     )
     scale_i, scale_j = (np.diag([focal, focal, 1.0]) for focal in (points.focal_i, points.focal_j))

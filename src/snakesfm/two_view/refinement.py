@@ -95,9 +95,9 @@ def _refine(
     if method == "bundle":
         return refine_bundle(points, rotation, translation, scale_px, 10)
     if far:
-        rotation, translation = _refine_poselib(points, rotation, translation, scale_px)
+        return _refine_poselib(points, rotation, translation, scale_px)
     # PoseLib weighs both images alike; this weighs each by its focal length
-    return refine_sampson(points, rotation, translation, scale_px, 1 if far else 5)
+    return refine_sampson(points, rotation, translation, scale_px, 5)
 
 
 def _refine_poselib(

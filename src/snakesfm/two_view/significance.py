@@ -4,14 +4,9 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import gammaln
 
 Array = NDArray[Any]
 LOG10 = float(np.log(10.0))
-
-
-def _log_choose(n: Array | float, k: Array | float) -> Any:
-    return gammaln(np.add(n, 1.0)) - gammaln(np.add(k, 1.0)) - gammaln(np.subtract(n, k) + 1.0)
 
 
 def significance_of(errors_px: Array, width_px: float, height_px: float, floor_px: float = 0.25) -> float:
@@ -33,12 +28,10 @@ def significance_of(errors_px: Array, width_px: float, height_px: float, floor_p
         return 0.0
     ordered = np.sort(np.maximum(np.abs(errors_px), floor_px))[sample:]
     agreeing = np.arange(sample + 1, count + 1)
+    log_factorials = np.concatenate([[0.0], np.cumsum(np.log(np.arange(1, count + 1)))])
+    log_samples = log_factorials[agreeing] - log_factorials[sample] - log_factorials[agreeing - sample]
+    log_subsets = log_factorials[count] - log_factorials[agreeing] - log_factorials[count - agreeing]
     area = max(width_px * height_px, 1.0)
     chance = np.minimum(1.0, 2.0 * ordered * np.hypot(width_px, height_px) / area)
-    log_alarms = (
-        np.log(count - sample)
-        + _log_choose(count, agreeing)
-        + _log_choose(agreeing, sample)
-        + (agreeing - sample) * np.log(chance)
-    )
+    log_alarms = np.log(count - sample) + log_subsets + log_samples + (agreeing - sample) * np.log(chance)
     return max(0.0, -float(log_alarms.min()) / LOG10)

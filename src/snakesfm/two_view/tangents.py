@@ -2,10 +2,9 @@
 
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
-
-from snakesfm.geometry.rotations import exp_so3
 
 Array = NDArray[Any]
 
@@ -36,7 +35,7 @@ def perturb_pose(rotation: Array, translation: Array, step: Array) -> tuple[Arra
     in its :func:`tangent_basis` and is made unit again.
     """
     moved = translation + tangent_basis(translation) @ step[3:]
-    return exp_so3(step[:3]) @ rotation, moved / np.linalg.norm(moved)
+    return cv2.Rodrigues(step[:3])[0] @ rotation, moved / np.linalg.norm(moved)
 
 
 def cross_matrix(v: Array) -> Array:

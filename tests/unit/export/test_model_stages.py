@@ -397,7 +397,7 @@ def write_former_stages(folder: Path, problem: SyntheticProblem) -> dict[str, ob
     times.write_text("s\th:m:s\tmax_rss\n12.5\t0:00:12\t321.0\n", "utf-8")
     names = ("graph", "rotations", "tracks", "points", "index", "reconstruction")
     inputs: dict[str, object] = {name: str(folder / f"{name}.h5") for name in names}
-    return {**inputs, "geometries": [str(folder / "geometries.h5")], "benchmarks": [str(times)]}
+    return {**inputs, "geometries": [str(folder / "geometries.h5")]}
 
 
 def report(
@@ -412,7 +412,7 @@ def report(
     inputs["metrics"] = str(tmp_path / "evaluate_model" / "metrics.json")
     write_json(tmp_path / "summary.json", {"warnings": ["camera 1: look <here>"]})
     inputs["summary"] = str(tmp_path / "summary.json")
-    output = tmp_path / "index.html"
+    output = tmp_path / "render_report" / "index.html"
     render_report.run(
         StageJob("render_report", "a <scene>", inputs, (output,), RenderReportOptions(**options))
     )

@@ -134,6 +134,7 @@ class Scene:
             describe_images.run(self.job("describe_images", DescribeImagesOptions(), inputs, [output]))
 
     def select(self, options, pairs_file=""):
+        options = options.resolve(len(NAMES), pairs_file)
         descriptors = self.block_files("descriptors") if "retrieval" in options.method else []
         inputs = {"index": self.file("index"), "descriptors": descriptors}
         select_pairs.run(

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from snakesfm.geometry.rotations import angle_between, angle_of, exp_so3
 from snakesfm.two_view.bundle import inverse_depths, refine_bundle
-from snakesfm.two_view.correspondences import correspond, one_to_one, unify_matches
+from snakesfm.two_view.correspondences import correspond, first_rows_at_place, one_to_one, unify_matches
 from snakesfm.two_view.sampson import (
     Correspondences,
     refine_sampson,
@@ -92,8 +92,9 @@ def test_significance_grows_with_agreement_and_is_nothing_for_chance() -> None:
 def test_duplicates_are_unified_and_conflicts_settled() -> None:
     keypoints = np.array([[1, 1], [2, 2], [1, 1], [3, 3]], dtype=np.float32)
     matches = np.array([[0, 1], [2, 1], [1, 3], [3, 3]], dtype=np.int32)
-    unified = unify_matches(keypoints, keypoints, matches)
+    places = first_rows_at_place(keypoints)
+    unified = unify_matches(places, places, matches)
     assert unified.tolist() == [[0, 1], [1, 3], [3, 3]]
     rows = one_to_one(unified, np.array([0.1, 0.5, -0.2]), np.ones(3, dtype=bool))
     assert rows.tolist() == [0, 2]
-    assert unify_matches(keypoints, keypoints, np.zeros((0, 2), dtype=np.int32)).shape == (0, 2)
+    assert unify_matches(places, places, np.zeros((0, 2), dtype=np.int32)).shape == (0, 2)

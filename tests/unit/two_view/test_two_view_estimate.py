@@ -8,6 +8,7 @@ import pytest
 
 from snakesfm.config.estimate_two_view import EstimateTwoViewOptions
 from snakesfm.geometry.rotations import angle_between, angle_of
+from snakesfm.two_view.correspondences import first_rows_at_place, unify_matches
 from snakesfm.two_view.estimate import TwoViewEstimate, estimate_two_view_geometry
 
 Views = Callable[..., Any]
@@ -146,8 +147,9 @@ def test_keypoints_at_one_place_count_once(two_views: Views) -> None:
     doubled_i = np.concatenate([views.keypoints_i, views.keypoints_i])
     doubled_j = np.concatenate([views.keypoints_j, views.keypoints_j])
     matches = np.concatenate([views.matches, views.matches + 100])
+    unified = unify_matches(first_rows_at_place(doubled_i), first_rows_at_place(doubled_j), matches)
     found = estimate_two_view_geometry(
-        doubled_i, doubled_j, matches, views.camera_i, views.camera_j, OPTIONS, 3
+        doubled_i, doubled_j, unified, views.camera_i, views.camera_j, OPTIONS, 3
     )
     assert found.match_count == 100
     assert found.inliers.max() < 100

@@ -1,0 +1,97 @@
+"""The plan: blocks, tiles, files and params, computed before anything runs."""
+
+import json
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from snakesfm.errors import ConfigError
+from snakesfm.plan import Plan, choose_blocks, tile_names
+from snakesfm.seeding import block_of, derive_seed
+
+
+def make_images(folder: Path, count: int) -> Path:
+    folder.mkdir(parents=True)
+    for number in range(count):
+        (folder / f"{number:03d}.jpg").write_bytes(b"bytes of image %d" % number)
+    return folder
+
+
+def plan_of(tmp_path: Path, **config: object) -> Plan:
+    return Plan({"output": str(tmp_path / "out"), **config})
+
+
+@given(st.integers(1, 40))
+def test_tiles_cover_every_pair_of_blocks_once(blocks: int) -> None:
+    tiles = [tuple(map(int, name.split("-"))) for name in tile_names(blocks)]
+    assert len(tiles) == len(set(tiles)) == blocks * (blocks + 1) // 2
+    assert all(0 <= a <= b < blocks for a, b in tiles)
+
+
+@given(st.integers(1, 200_000), st.integers(1, 200_000))
+def test_more_images_never_get_fewer_blocks(first: int, second: int) -> None:
+    low, high = sorted((first, second))
+    assert 2 <= choose_blocks(low) <= choose_blocks(high) <= 128
+
+
+@given(st.text(min_size=1), st.integers(1, 64))
+def test_a_block_depends_on_the_name_alone(name: str, blocks: int) -> None:
+    assert 0 <= block_of(name, blocks) < blocks
+    assert block_of(name, blocks) == block_of(name, blocks)
+
+
+def test_blocks_are_of_like_size() -> None:
+    counts = [0] * 8
+    for number in range(4000):
+        counts[block_of(f"DSC_{number:05d}.JPG", 8)] += 1
+    assert 400 < min(counts) <= max(counts) < 600
+
+
+def test_seeds_differ_by_what_they_are_for_and_fit_31_bits() -> None:
+    seeds = {derive_seed(0, "match_pairs", f"{k}.jpg") for k in range(1000)}
+    assert len(seeds) == 1000
+    assert all(0 <= seed < 2**31 for seed in seeds)
+    assert derive_seed(0, "a", "b") != derive_seed(0, "ab") != derive_seed(1, "ab")
+
+
+def test_small_scenes_are_exhaustive_and_large_ones_retrieve(tmp_path: Path) -> None:
+    make_images(tmp_path / "small", 5)
+    make_images(tmp_path / "large", 400)
+    small = plan_of(tmp_path, images=str(tmp_path / "small")).scenes["small"]
+    large = plan_of(tmp_path, images=str(tmp_path / "large")).scenes["large"]
+    assert small.select_pairs.method == "exhaustive"
+    assert small.global_descriptors() == []
+    assert not [file for file in small.all_files() if "describe_images" in file]
+    assert large.select_pairs.method == "sequential+retrieval"
+    assert len(large.global_descriptors()) == large.blocks == 4
+
+
+def test_params_are_canonical_and_follow_content_not_time(tmp_path: Path) -> None:
+    folder = make_images(tmp_path / "scene", 3)
+    first = plan_of(tmp_path, images=str(folder)).scenes["scene"].params("index_images", {}, True)
+    for image in folder.iterdir():
+        image.touch()
+    again = plan_of(tmp_path, images=str(folder)).scenes["scene"].params("index_images", {}, True)
+    (folder / "001.jpg").write_bytes(b"other bytes")
+    changed = plan_of(tmp_path, images=str(folder)).scenes["scene"].params("index_images", {}, True)
+    assert first == again != changed
+    assert json.dumps(json.loads(first), sort_keys=True) == first
+
+
+def test_scenes_of_other_sizes_have_rules_of_their_own(tmp_path: Path) -> None:
+    make_images(tmp_path / "a", 3)
+    make_images(tmp_path / "b", 70)
+    scenes = {name: {"images": str(tmp_path / name)} for name in "ab"}
+    plan = plan_of(tmp_path, scenes=scenes)
+    assert plan.scenes_by_blocks() == {2: ["a"], 4: ["b"]}
+    assert plan.select_pairs_rule(2) == "select_pairs_2_blocks"
+    assert plan_of(tmp_path, scenes={"a": scenes["a"]}).select_pairs_rule(2) == "select_pairs"
+
+
+@pytest.mark.parametrize("output", ["{braces}", "a{b"])
+def test_an_output_folder_with_braces_is_refused(tmp_path: Path, output: str) -> None:
+    make_images(tmp_path / "scene", 2)
+    with pytest.raises(ConfigError, match="braces"):
+        Plan({"images": str(tmp_path / "scene"), "output": str(tmp_path / output)})
