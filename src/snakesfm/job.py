@@ -26,15 +26,22 @@ def run_job(stage: str, snakemake: Any) -> None:
     for variable in THREAD_VARIABLES:
         os.environ[variable] = "1"
     terminal = _redirect_to_log(Path(snakemake.log[0]))
-    started = time.monotonic()
     try:
         job = _bind(stage, snakemake, terminal)
-        print(f"{stage} {job.output}", flush=True)
-        importlib.import_module(f"snakesfm.stages.{stage}").run(job)
-        _keep_former(job)
+        module = importlib.import_module(f"snakesfm.stages.{stage}")
+        started = time.time()
+        print(f"{_clock(started)} {stage} {job.output}", flush=True)
+        module.run(job)
+        _keep_former(job, module)
     except Exception as error:
         _fail(stage, snakemake, error, terminal)
-    print(f"{stage} done in {time.monotonic() - started:.1f} s", flush=True)
+    ended = time.time()
+    print(f"{_clock(ended)} {stage} done in {ended - started:.2f} s", flush=True)
+
+
+def _clock(seconds: float) -> str:
+    """Local date and time to the millisecond."""
+    return time.strftime("%Y-%m-%dT%H:%M:%S", time.localtime(seconds)) + f".{int(seconds % 1 * 1000):03d}"
 
 
 def _redirect_to_log(path: Path) -> Any:
@@ -79,9 +86,8 @@ def former_path(output: Path) -> Path:
     return output.parent / ".former" / output.name
 
 
-def _keep_former(job: Any) -> None:
+def _keep_former(job: Any, module: Any) -> None:
     """Hard-link the finished output of a stage that reuses unchanged parts of its former file."""
-    module = importlib.import_module(f"snakesfm.stages.{job.stage}")
     if not getattr(module, "REUSES_FORMER", False):
         return
     former = former_path(job.output)

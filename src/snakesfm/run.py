@@ -4,6 +4,7 @@ import contextlib
 import fcntl
 import json
 import os
+import threading
 import time
 from pathlib import Path
 from typing import Any
@@ -60,11 +61,13 @@ class Run:
 
     def finish(self) -> None:
         """One line per scene about its model."""
+        _cancel_timers()
         for scene in self.plan.scenes.values():
             print(self.describe(scene), flush=True)
 
     def fail(self) -> None:
         """One line per scene: its model where it has one, else the sentences of its failed jobs."""
+        _cancel_timers()
         for scene in self.plan.scenes.values():
             sentences = self.failures(scene)
             if sentences:
@@ -107,3 +110,10 @@ class Run:
             f"{summary['mean_reprojection_error_px']:.3f} px{accuracy}, "
             f"{time.time() - self.started:.0f} s; model in {path.parent / 'sparse' / '0'}"
         )
+
+
+def _cancel_timers() -> None:
+    """End Snakemake's benchmark timers, which outlive their jobs and hold the process for a second."""
+    for thread in threading.enumerate():
+        if isinstance(thread, threading.Timer):
+            thread.cancel()

@@ -1,6 +1,7 @@
 """Whole runs on a small rendered scene: results, resuming, re-running, killing."""
 
 import json
+import re
 import shutil
 import signal
 from pathlib import Path
@@ -101,6 +102,8 @@ def test_a_deleted_tile_is_made_again_with_what_depends_on_it_alone(
         ["match_pairs", "calibrate_cameras", *["estimate_two_view"] * 3, *MAPPING]
     )
     assert model_bytes(output) == model_bytes(finished[0])
+    log = (output / "logs" / "match_pairs" / "0-1.log").read_text()
+    assert re.search(r"([1-9]\d*) pairs \(\1 taken over\)", log)
 
 
 def test_an_option_reaches_its_stage_and_what_follows_alone(finished, small_scene: Path, workflow) -> None:

@@ -26,6 +26,9 @@ Array = NDArray[Any]
 Row = dict[str, Any]
 
 
+REUSES_FORMER = True
+
+
 def run(job: StageJob) -> None:
     """Estimate every pair of the tile whose inputs have changed, and write all of them."""
     options: EstimateTwoViewOptions = job.options

@@ -32,6 +32,9 @@ class ColoredKeypoints:
     colors: Array
 
 
+REUSES_FORMER = True
+
+
 def run(job: StageJob) -> None:
     """Read the block's images one by one and write their LocalFeatures.
 

@@ -23,6 +23,9 @@ Array = NDArray[Any]
 Matches = tuple[Array, Array]
 
 
+REUSES_FORMER = True
+
+
 def run(job: StageJob) -> None:
     """Match pair after pair, taking over pairs whose images and options are unchanged; write PairMatches.
 
