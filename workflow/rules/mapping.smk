@@ -122,7 +122,6 @@ rule adjust_bundle:
         log_file("adjust_bundle"),
     benchmark:
         benchmark_file("adjust_bundle")
-    threads: 2
     params:
         job=job_params("adjust_bundle"),
     script:

@@ -19,7 +19,7 @@ class SelectPairsOptions(StageOptions):
     )
     """All pairs, neighbours in the order of names, similar images, both, or a list's; 'auto' decides."""
 
-    exhaustive_up_to: int = Field(60, ge=2, le=100_000)
+    exhaustive_up_to: int = Field(200, ge=2, le=100_000)
     """Number of images up to which 'auto' takes all pairs, and sequential+retrieval beyond."""
 
     look_ahead: int = Field(10, ge=1, le=10_000)
