@@ -113,8 +113,10 @@ class ScenePlan:
 
     def options(self, stage: str) -> StageOptions:
         """The options of a stage in this scene."""
-        options: StageOptions = self.configuration.__getattribute__(stage)
-        return self.select_pairs if stage == "select_pairs" else options
+        if stage == "select_pairs":
+            return self.select_pairs
+        options: StageOptions = getattr(self.configuration, stage)
+        return options
 
     def files(self, stage: str, parts: str) -> list[str]:
         """All files of a stage that works on 'blocks' or on 'tiles'."""

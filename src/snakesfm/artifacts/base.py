@@ -136,6 +136,14 @@ class Artifact:
         return cls(**values)
 
     @classmethod
+    def read_former(cls, path: Path | None) -> Self | None:
+        """Read an earlier version of a stage's output; None where there is none that can be read."""
+        try:
+            return cls.read(path) if path is not None else None
+        except ArtifactError:
+            return None
+
+    @classmethod
     def open(cls, path: Path | str) -> h5py.File:
         """Open an artifact's file for reading after checking its kind and version.
 

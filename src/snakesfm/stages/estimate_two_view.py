@@ -147,11 +147,8 @@ COLUMNS: dict[str, tuple[tuple[int, ...], str]] = {
 
 def _read_former(path: Path | None) -> dict[str, Row]:
     """Results of an earlier run by their digest; nothing where it cannot be read."""
-    if path is None:
-        return {}
-    try:
-        former = TwoViewGeometries.read(path)
-    except ArtifactError:
+    former = TwoViewGeometries.read_former(path)
+    if former is None:
         return {}
     rows: dict[str, Row] = {}
     for k, digest in enumerate(former.digests):

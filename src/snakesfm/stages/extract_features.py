@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from snakesfm.artifacts.features import LocalFeatures
 from snakesfm.artifacts.images import ImageIndex
-from snakesfm.errors import ArtifactError, ImageError
+from snakesfm.errors import ImageError
 from snakesfm.features.extraction import create_detector, extract_keypoints, sample_colors
 from snakesfm.features.keypoints import Detector, KeypointSet
 from snakesfm.ingest.read import read_image
@@ -93,11 +93,8 @@ def _extract(
 
 def _read_former(path: Path | None, wanted: set[str]) -> Mapping[str, ColoredKeypoints]:
     """What an earlier file holds of the images that are unchanged, by digest."""
-    if path is None:
-        return {}
-    try:
-        former = LocalFeatures.read(path)
-    except ArtifactError:
+    former = LocalFeatures.read_former(path)
+    if former is None:
         return {}
     taken = {}
     for row, digest in enumerate(former.digests):

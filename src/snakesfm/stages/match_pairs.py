@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from snakesfm.artifacts.features import LocalFeatures
 from snakesfm.artifacts.pairs import ImagePairs, PairMatches
-from snakesfm.errors import ArtifactError
 from snakesfm.features.keypoints import KeypointSet
 from snakesfm.matching.matcher import create_matcher
 from snakesfm.stages.job import StageJob
@@ -92,11 +91,8 @@ def _digest(first: str, second: str, options: "MatchPairsOptions") -> str:
 
 def _read_former(path: Path | None, wanted: set[str]) -> Mapping[str, Matches]:
     """What an earlier file holds of the pairs that are unchanged, by digest."""
-    if path is None:
-        return {}
-    try:
-        former = PairMatches.read(path)
-    except ArtifactError:
+    former = PairMatches.read_former(path)
+    if former is None:
         return {}
     parts = [slice(*former.offsets[row : row + 2]) for row in range(len(former.pairs))]
     return {
