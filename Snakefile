@@ -28,12 +28,18 @@ include: "workflow/rules/reporting.smk"
 
 localrules:
     all,
+    databases,
 
 
 rule all:
     default_target: True
     input:
         all_files(),
+
+
+rule databases:
+    input:
+        all_databases(),
 
 
 onstart:

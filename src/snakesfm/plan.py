@@ -137,6 +137,10 @@ class ScenePlan:
         names = ("export_model/summary.json", "evaluate_model/metrics.json", "render_report/index.html")
         return [str(self.folder / name) for name in names]
 
+    def database_file(self) -> str:
+        """The COLMAP database of features and two-view geometries, which only its own target makes."""
+        return str(self.folder / "export_database" / "database.db")
+
     def all_files(self) -> list[str]:
         """What a run makes of the scene; Snakemake re-makes a lost file only if it is asked for by name."""
         files = [str(self.folder / name) for name in SCENE_ARTIFACTS]

@@ -190,3 +190,16 @@ def test_several_scenes_run_together_and_a_bad_one_does_not_stop_the_others(
     assert "16 of 16 images" in lines["square"]
     assert "failed" in lines["single"]
     assert "Traceback" not in outcome.text
+
+
+def test_the_database_is_made_by_its_own_target_alone(finished, small_scene: Path, workflow) -> None:
+    copy_run(finished[0], workflow.folder)
+    file = workflow.folder / "out" / "square" / "export_database" / "database.db"
+    assert not file.exists()
+    outcome = workflow.run("databases", *config_of(small_scene))
+    assert outcome.status == 0
+    assert [rule for rule in outcome.rules if rule != "databases"] == ["export_database"]
+    database = pycolmap.Database.open(file)
+    assert database.num_images() == database.num_frames() == 16
+    assert database.num_verified_image_pairs() > 30
+    database.close()

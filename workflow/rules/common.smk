@@ -78,6 +78,11 @@ def all_files():
     return [path for scene in PLAN.scenes.values() for path in scene.all_files()]
 
 
+def all_databases():
+    """The COLMAP databases of all scenes."""
+    return [scene.database_file() for scene in PLAN.scenes.values()]
+
+
 def start_run():
     """Lock the output folder for this run, and say what is about to be done."""
     try:

@@ -1,4 +1,23 @@
-# The model in the formats that others read, and how good it is.
+# The model, and what it was made from, in the formats that others read, and how good it is.
+
+
+rule export_database:
+    input:
+        index=artifact("index_images", "index.h5"),
+        cameras=artifact("calibrate_cameras", "cameras.h5"),
+        features=files_of("extract_features", "blocks"),
+        matches=files_of("match_pairs", "tiles"),
+        geometries=files_of("estimate_two_view", "tiles"),
+    output:
+        artifact("export_database", "database.db"),
+    log:
+        log_file("export_database"),
+    benchmark:
+        benchmark_file("export_database")
+    params:
+        job=job_params("export_database"),
+    script:
+        "../../scripts/export_database.py"
 
 
 rule export_model:

@@ -29,6 +29,7 @@ STAGES: tuple[str, ...] = (
     "average_translations",
     "triangulate_tracks",
     "adjust_bundle",
+    "export_database",
     "export_model",
     "evaluate_model",
     "render_report",

@@ -1,0 +1,10 @@
+"""Options of export_database."""
+
+from snakesfm.config.base import StageOptions
+
+
+class ExportDatabaseOptions(StageOptions):
+    """The COLMAP database of features and two-view geometries; made only by the target `databases`."""
+
+    descriptors: bool = True
+    """Also write descriptors, which COLMAP needs to match further pairs; its mappers do without them."""
