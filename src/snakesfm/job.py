@@ -29,14 +29,24 @@ def run_job(stage: str, snakemake: Any) -> None:
     try:
         job = _bind(stage, snakemake, terminal)
         module = importlib.import_module(f"snakesfm.stages.{stage}")
-        started = time.time()
+        started, before = time.time(), _processor_seconds()
         print(f"{_clock(started)} {stage} {job.output}", flush=True)
         module.run(job)
         _keep_former(job, module)
     except Exception as error:
         _fail(stage, snakemake, error, terminal)
     ended = time.time()
-    print(f"{_clock(ended)} {stage} done in {ended - started:.2f} s", flush=True)
+    print(
+        f"{_clock(ended)} {stage} done in {ended - started:.2f} s, "
+        f"{_processor_seconds() - before:.2f} s of processor time",
+        flush=True,
+    )
+
+
+def _processor_seconds() -> float:
+    """Processor time of this process and of its children that ended."""
+    times = os.times()
+    return times.user + times.system + times.children_user + times.children_system
 
 
 def _clock(seconds: float) -> str:

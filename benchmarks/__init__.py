@@ -1,0 +1,1 @@
+"""Measurements against other systems; no part of the library."""

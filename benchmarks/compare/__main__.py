@@ -1,0 +1,97 @@
+"""Command line: ``python -m benchmarks.compare [run | render | ablate]``."""
+
+import argparse
+import os
+import shlex
+import sys
+from pathlib import Path
+
+from benchmarks.compare.ablate import ablate
+from benchmarks.compare.measure import ROOT
+from benchmarks.compare.results import METHODS, read_results
+from benchmarks.compare.run import Campaign
+from benchmarks.compare.sets import read_sets
+from benchmarks.compare.tables import describe_machine, render_csv, render_page
+from snakesfm.errors import SnakesfmError
+
+COMMANDS = ("run", "render", "ablate")
+DATA = ROOT.parent / "shared" / "data"
+
+
+def parse(arguments: list[str]) -> argparse.Namespace:
+    """The command line; without a command it is ``run``."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.compare", description=__doc__)
+    commands = parser.add_subparsers(dest="command", required=True)
+    run = commands.add_parser("run", help="run what is not stored yet, then render")
+    render = commands.add_parser("render", help="write the tables from what is stored")
+    switch = commands.add_parser("ablate", help="change one option at a time")
+    for command in (run, switch):
+        command.add_argument("--data", type=Path, default=DATA, help="folder of the image sets")
+        command.add_argument("--sets", nargs="*", default=[], help="names of sets (all)")
+        command.add_argument("--threads", type=int, default=os.cpu_count())
+        command.add_argument(
+            "--limit", type=float, default=3600, help="longest time of one command in seconds"
+        )
+    for command in (run, render, switch):
+        command.add_argument("--out", type=Path, required=True, help="folder of results and working files")
+    for command in (run, render):
+        command.add_argument("--page", type=Path, help="Markdown page (OUT/benchmarks.md)")
+    run.add_argument("--seeds", type=int, default=3)
+    run.add_argument("--large-seeds", type=int, default=3, help="seeds on sets above 60 images")
+    run.add_argument("--methods", nargs="*", choices=METHODS, default=list(METHODS))
+    run.add_argument("--retime", action="store_true", help="repeat what others on the machine disturbed")
+    switch.add_argument("--options", type=Path, default=ROOT / "benchmarks" / "ablations.yaml")
+    switch.add_argument("--names", nargs="*", default=[], help="names of options in that file (all)")
+    plain = arguments and arguments[0] not in (*COMMANDS, "-h", "--help")
+    return parser.parse_args(["run", *arguments] if plain or not arguments else arguments)
+
+
+def main(arguments: list[str]) -> int:
+    """Do one command; 1 where its input is wrong."""
+    given = parse(arguments)
+    given.out = given.out.resolve()
+    try:
+        if given.command == "ablate":
+            ablate(
+                read_sets(given.data, given.sets),
+                given.options,
+                given.names,
+                given.out,
+                given.threads,
+                given.limit,
+            )
+            return 0
+        if given.command == "run":
+            campaign = Campaign(
+                given.out,
+                given.seeds,
+                given.large_seeds,
+                given.threads,
+                given.limit,
+                tuple(given.methods),
+                given.retime,
+            )
+            command = "python -m benchmarks.compare " + shlex.join(arguments)
+            for image_set in read_sets(given.data, given.sets):
+                campaign.run(image_set)
+                (given.out / "command.txt").write_text(command + "\n", "utf-8")
+                write_tables(given.out, given.page)
+        write_tables(given.out, given.page)
+    except SnakesfmError as error:
+        sys.stderr.write(f"{error}\n")
+        return 1
+    return 0
+
+
+def write_tables(folder: Path, page: Path | None) -> None:
+    """Write the page, and the CSV file beside it."""
+    page = page or folder / "benchmarks.md"
+    results = read_results(folder / "results")
+    command = folder / "command.txt"
+    text = command.read_text("utf-8").strip() if command.is_file() else "python -m benchmarks.compare"
+    page.write_text(render_page(results, describe_machine(), text), "utf-8")
+    page.with_suffix(".csv").write_text(render_csv(results), "utf-8")
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,195 @@
+"""The methods that are compared: each goes from images, or from an exported database, to a model."""
+
+import csv
+import json
+import re
+import shutil
+import sys
+from collections.abc import Iterable
+from dataclasses import asdict
+from datetime import datetime
+from pathlib import Path
+
+from benchmarks.compare.measure import ROOT, Cost, run_measured, run_operation
+from benchmarks.compare.sets import ImageSet
+from snakesfm.artifacts import ImageIndex, PairMatches
+
+FEATURES = 5000
+EXTRACT = (
+    "index_images",
+    "extract_features",
+    "learn_vocabulary",
+    "describe_images",
+    "select_pairs",
+)
+MATCH = ("match_pairs", "calibrate_cameras", "estimate_two_view")
+MAP = (
+    "build_view_graph",
+    "filter_view_graph",
+    "average_rotations",
+    "build_tracks",
+    "average_translations",
+    "triangulate_tracks",
+    "adjust_bundle",
+)
+STARTED = re.compile(r"^(\d{4}-\d\d-\d\dT\S+) (\w+) (?!done in )", re.M)
+ENDED = re.compile(r"^(\d{4}-\d\d-\d\dT\S+) (\w+) done in [\d.]+ s, ([\d.]+) s of processor time$", re.M)
+
+
+def snakesfm(
+    image_set: ImageSet,
+    folder: Path,
+    seed: int,
+    threads: int,
+    limit_s: float,
+    options: Iterable[str] = (),
+    target: str = "all",
+) -> dict[str, Cost]:
+    """The workflow as users run it, into folder/out/SET; what it cost in all and per group of stages.
+
+    ``options`` are more items for ``--config``.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    config = [f"images={image_set.images}", f"reference={image_set.reference}", "output=out"]
+    config += [f"scene={image_set.name}", f"seed={seed}", *options]
+    if image_set.known:
+        config.append(f"cameras={image_set.reference}")
+    command = [sys.executable, "-m", "snakemake", target, "--snakefile", str(ROOT / "Snakefile")]
+    command += ["--profile", str(ROOT / "profiles" / "local"), "--cores", str(threads), "--config", *config]
+    whole = run_measured(command, folder, folder / f"{Path(target).stem}.log", limit_s)
+    return {**stage_costs(folder / "out" / image_set.name / "logs", whole), "total": whole}
+
+
+def stage_costs(logs: Path, whole: Cost) -> dict[str, Cost]:
+    """Cost of extract, match and map, from the last start and end in each job's log.
+
+    The wall clock of a group runs from the end of the group before it to the end of its own last job, so
+    that what Snakemake does between jobs is counted. Memory is the largest job's, as Snakemake saw it.
+    """
+    jobs = {path: path.read_text("utf-8") for path in logs.glob("*/*.log")}
+    costs: dict[str, Cost] = {}
+    since = min(_clock(found[1]) for text in jobs.values() if (found := _last(STARTED, text)))
+    for name, stages in (("extract", EXTRACT), ("match", MATCH), ("map", MAP)):
+        ends = [
+            found
+            for path, text in jobs.items()
+            if path.parent.name in stages and (found := _last(ENDED, text))
+        ]
+        until = max((_clock(found[1]) for found in ends), default=since)
+        cpu_seconds = sum(float(found[3]) for found in ends)
+        peak_mib = max((_largest_mib(logs.parent / "benchmarks" / stage) for stage in stages), default=0.0)
+        costs[name] = Cost(round(until - since, 2), round(cpu_seconds, 2), peak_mib, whole.others)
+        since = until
+    return costs
+
+
+def _largest_mib(folder: Path) -> float:
+    """The largest resident memory in a stage's benchmark files; 0 where there is none."""
+    sizes = [0.0]
+    for path in folder.glob("*.tsv"):
+        with path.open(encoding="utf-8") as file:
+            sizes += [
+                float(row["max_rss"])
+                for row in csv.DictReader(file, delimiter="\t")
+                if row["max_rss"] != "NA"
+            ]
+    return max(sizes)
+
+
+def _last(pattern: re.Pattern[str], text: str) -> re.Match[str] | None:
+    found = None
+    for found in pattern.finditer(text):  # noqa: B007
+        pass
+    return found
+
+
+def _clock(text: str) -> float:
+    return datetime.fromisoformat(text).timestamp()
+
+
+def write_pairs(scene: Path, path: Path, least_matches: int) -> int:
+    """List the pairs of a finished snakesfm run that have ``least_matches`` or more; how many there are."""
+    names = ImageIndex.read(scene / "index_images" / "index.h5").names
+    lines = []
+    for file in sorted((scene / "match_pairs").glob("*.h5")):
+        with PairMatches.open(file) as tile:
+            offsets = tile["offsets"][()].tolist()
+            for row, (i, j) in enumerate(tile["pairs"][()].tolist()):
+                if offsets[row + 1] - offsets[row] >= least_matches:
+                    lines.append(f"{names[i]} {names[j]}\n")
+    path.write_text("".join(lines), "utf-8")
+    return len(lines)
+
+
+def colmap_front_end(
+    image_set: ImageSet, folder: Path, pairs: str, threads: int, limit_s: float
+) -> dict[str, Cost]:
+    """COLMAP's own features and matches in folder/database.db, made once; the cost of both stages.
+
+    ``pairs`` is a file that lists the pairs, or '' for all.
+    """
+    record = folder / "cost.json"
+    if record.is_file():
+        return {name: Cost(**cost) for name, cost in json.loads(record.read_text("utf-8")).items()}
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
+    database = str(folder / "database.db")
+    extraction = {
+        "images": str(image_set.images),
+        "database": database,
+        "cameras": image_set.camera_groups(),
+        "features": FEATURES,
+        "threads": threads,
+    }
+    matching = {"database": database, "pairs": pairs, "threads": threads}
+    costs = {
+        "extract": run_operation("extract", extraction, folder / "extract.log", limit_s),
+        "match": run_operation("match", matching, folder / "match.log", limit_s),
+    }
+    record.write_text(json.dumps({name: asdict(cost) for name, cost in costs.items()}), "utf-8")
+    return costs
+
+
+def colmap_map(
+    operation: str,
+    image_set: ImageSet,
+    database: Path,
+    folder: Path,
+    calibrate: bool,
+    seed: int,
+    threads: int,
+    limit_s: float,
+) -> Cost:
+    """COLMAP's mapper ``map_incremental`` or ``map_global`` on a copy of a database, into folder/model."""
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
+    copy = folder / "database.db"
+    shutil.copyfile(database, copy)
+    arguments = {
+        "database": str(copy),
+        "images": str(image_set.images),
+        "output": str(folder),
+        "fixed": image_set.known,
+        "seed": seed,
+        "threads": threads,
+    }
+    if operation == "map_global":
+        arguments["calibrate"] = calibrate
+    try:
+        return run_operation(operation, arguments, folder / "map.log", limit_s)
+    finally:
+        copy.unlink()
+
+
+def openmvg(image_set: ImageSet, folder: Path, seed: int, threads: int, limit_s: float) -> Cost:
+    """OpenMVG's global engine with its own front-end, into folder/model."""
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
+    arguments = {
+        "images": str(image_set.images),
+        "output": str(folder),
+        "intrinsics": image_set.pinhole(),
+        "seed": seed,
+        "threads": threads,
+    }
+    return run_operation("openmvg", arguments, folder / "openmvg.log", limit_s)

@@ -1,0 +1,104 @@
+"""What was measured, one JSON file per set, method, setting and seed."""
+
+import json
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.compare.measure import Cost
+from snakesfm.evaluation.colmap_model import model_poses, read_model
+from snakesfm.evaluation.metrics import evaluate_poses, model_metrics
+
+OURS = "snakesfm"
+INCREMENTAL = "colmap_incremental"
+GLOBAL = "colmap_global"
+OPENMVG = "openmvg_global"
+METHODS = (OURS, INCREMENTAL, GLOBAL, OPENMVG)
+PEERS = (INCREMENTAL, GLOBAL)
+OWN, SAME = "own", "same"
+SETTINGS = (OWN, SAME)
+
+
+@dataclass(frozen=True)
+class Result:
+    """One run.
+
+    Attributes
+    ----------
+    image_set, images, known, truth : name, number of images, whether intrinsics were given, and whether the
+        reference is surveyed rather than COLMAP's.
+    method, setting, seed : which of METHODS, with its own front-end or on the same features as snakesfm.
+    failure : why there is no model; empty where there is one.
+    metrics : the project's own evaluation of the model.
+    stages : cost of extract, match, map and total; those that the setting has.
+    inputs : digest of what the run started from; a result of other inputs is made again.
+    note : what a reader must know, such as a list of pairs.
+    """
+
+    image_set: str
+    images: int
+    known: bool
+    truth: bool
+    method: str
+    setting: str
+    seed: int
+    inputs: str = ""
+    failure: str = ""
+    note: str = ""
+    date: str = ""
+    metrics: dict[str, Any] = field(default_factory=dict)
+    stages: dict[str, Cost] = field(default_factory=dict)
+
+    def path(self, folder: Path) -> Path:
+        """Its file below the folder of results."""
+        return folder / f"{self.image_set}.{self.method}.{self.setting}.{self.seed}.json"
+
+    def write(self, folder: Path) -> None:
+        """Store it."""
+        folder.mkdir(parents=True, exist_ok=True)
+        temporary = self.path(folder).with_suffix(".tmp")
+        temporary.write_text(json.dumps(asdict(self), indent=1, sort_keys=True) + "\n", "utf-8")
+        temporary.replace(self.path(folder))
+
+    def stored(self, folder: Path) -> "Result | None":
+        """The stored result of the same run with the same inputs."""
+        path = self.path(folder)
+        result = read_result(path) if path.is_file() else None
+        return result if result is not None and result.inputs == self.inputs else None
+
+    @property
+    def undisturbed(self) -> bool:
+        """Whether its wall clock may be trusted."""
+        return all(cost.undisturbed for cost in self.stages.values())
+
+
+def read_result(path: Path) -> Result:
+    """Read one stored result."""
+    content = json.loads(path.read_text("utf-8"))
+    content["stages"] = {name: Cost(**cost) for name, cost in content["stages"].items()}
+    return Result(**content)
+
+
+def read_results(folder: Path) -> list[Result]:
+    """All stored results, snakesfm's also as those of the setting SAME, which it shares by definition."""
+    results = [read_result(path) for path in sorted(folder.glob("*.json"))]
+    shared = [
+        replace(result, setting=SAME, stages={k: v for k, v in result.stages.items() if k == "map"})
+        for result in results
+        if result.method == OURS
+    ]
+    return results + shared
+
+
+def evaluate(model_folder: Path, reference: Path) -> dict[str, Any]:
+    """The metrics of a model; reprojection errors are computed anew, alike for every method."""
+    model = read_model(model_folder)
+    model.update_point_3d_errors()
+    points = [model.points3D[key] for key in sorted(model.points3D)]
+    offsets = np.r_[0, np.cumsum([point.track.length() for point in points], dtype=np.int64)]
+    registered = np.array([image.has_pose for image in model.images.values()], dtype=bool)
+    errors_px = np.array([point.error for point in points], dtype=np.float64)
+    evaluation = evaluate_poses(model_poses(model), model_poses(read_model(reference)))
+    return {**model_metrics(registered, offsets, errors_px), **evaluation.metrics}

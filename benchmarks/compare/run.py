@@ -1,0 +1,206 @@
+"""Runs all methods on sets, stores every result as it comes, and takes over what is stored."""
+
+import contextlib
+import hashlib
+import shutil
+import traceback
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from importlib.metadata import version
+from pathlib import Path
+
+from benchmarks.compare import methods
+from benchmarks.compare.measure import ROOT, CommandError, Cost
+from benchmarks.compare.results import GLOBAL, INCREMENTAL, OPENMVG, OURS, OWN, SAME, Result, evaluate
+from benchmarks.compare.sets import ImageSet
+
+OPERATIONS = {INCREMENTAL: "map_incremental", GLOBAL: "map_global"}
+LARGE_SET = 60
+PAIR_MATCHES = 30
+SOURCES = ("Snakefile", "config.yaml", "scripts", "workflow/rules", "src/snakesfm")
+Costs = dict[str, Cost]
+
+
+@dataclass(frozen=True)
+class Campaign:
+    """One comparison.
+
+    Attributes
+    ----------
+    folder : gets results/ and work/SET/.
+    seeds, large_seeds : how many seeds, and how many on sets of more than LARGE_SET images.
+    threads : of every method.
+    limit_s : longest time of one command.
+    chosen : methods to run.
+    retime : make again what was measured while others used the processor.
+    """
+
+    folder: Path
+    seeds: int
+    large_seeds: int
+    threads: int
+    limit_s: float
+    chosen: tuple[str, ...]
+    retime: bool = False
+
+    @property
+    def results(self) -> Path:
+        """Folder of the stored results."""
+        return self.folder / "results"
+
+    def run(self, image_set: ImageSet) -> None:
+        """All methods on one set."""
+        images = len(image_set.image_names())
+        large = images > LARGE_SET
+        seeds = range(self.large_seeds if large else self.seeds)
+        work = self.folder / "work" / image_set.name
+        blank = Result(image_set.name, images, image_set.known, image_set.truth, "", "", 0)
+        if OURS in self.chosen:
+            for seed in seeds:
+                self._run_ours(image_set, work, replace(blank, method=OURS, setting=OWN, seed=seed))
+        scene = work / "snakesfm-0" / "out" / image_set.name
+        peers = [method for method in OPERATIONS if method in self.chosen]
+        if peers:
+            note, pairs = "", ""
+            if large:
+                with contextlib.suppress(FileNotFoundError):
+                    count = methods.write_pairs(scene, work / "pairs.txt", PAIR_MATCHES)
+                    pairs = str(work / "pairs.txt")
+                    note = f"{count} of {images * (images - 1) // 2} pairs: those with at least "
+                    note += f"{PAIR_MATCHES} matches in snakesfm"
+            self._run_own(image_set, work, replace(blank, setting=OWN, note=note), peers, seeds, pairs)
+            self._run_same(image_set, work, scene, replace(blank, setting=SAME), peers, seeds)
+        if OPENMVG in self.chosen:
+            for seed in seeds:
+                result = replace(
+                    blank, method=OPENMVG, setting=OWN, seed=seed, inputs=version("openmvg-rs")
+                )
+                folder = work / f"openmvg-{seed}"
+
+                def run(folder: Path = folder, seed: int = seed) -> Costs:
+                    cost = methods.openmvg(image_set, folder, seed, self.threads, self.limit_s)
+                    return {"total": cost}
+
+                self._measure(image_set, result, folder / "model", run)
+
+    def _run_ours(self, image_set: ImageSet, work: Path, result: Result) -> None:
+        """Snakesfm from images to model; of the first seed the database too, beside the measurement."""
+        folder = work / f"snakesfm-{result.seed}"
+        scene = folder / "out" / image_set.name
+
+        def run() -> Costs:
+            shutil.rmtree(folder, ignore_errors=True)
+            return methods.snakesfm(image_set, folder, result.seed, self.threads, self.limit_s)
+
+        result = replace(result, inputs=source_digest())
+        self._measure(image_set, result, scene / "export_model" / "sparse" / "0", run)
+        if result.seed == 0 and not (scene / "export_database" / "database.db").is_file():
+            with contextlib.suppress(CommandError):
+                methods.snakesfm(image_set, folder, 0, self.threads, self.limit_s, target="databases")
+        if result.seed > 0:
+            for stage in ("extract_features", "match_pairs", "estimate_two_view"):
+                shutil.rmtree(scene / stage, ignore_errors=True)
+
+    def _run_own(
+        self, image_set: ImageSet, work: Path, blank: Result, peers: list[str], seeds: range, pairs: str
+    ) -> None:
+        """COLMAP's mappers after its own front-end, which they share."""
+        front = work / "colmap"
+        inputs = version("pycolmap") + blank.note
+        runs = [replace(blank, method=m, seed=s, inputs=inputs) for s in seeds for m in peers]
+        if all(self._taken_over(result) for result in runs):
+            return
+        try:
+            costs = methods.colmap_front_end(image_set, front, pairs, self.threads, self.limit_s)
+            if self.retime and not all(cost.undisturbed for cost in costs.values()):
+                (front / "cost.json").unlink()
+                costs = methods.colmap_front_end(image_set, front, pairs, self.threads, self.limit_s)
+        except CommandError as error:
+            for result in runs:
+                _report(replace(result, failure=f"front-end {error}")).write(self.results)
+            return
+        for result in runs:
+            self._map(image_set, work, front / "database.db", result, costs)
+
+    def _run_same(
+        self, image_set: ImageSet, work: Path, scene: Path, blank: Result, peers: list[str], seeds: range
+    ) -> None:
+        """COLMAP's mappers on the features, pairs and two-view geometries of snakesfm's first seed."""
+        database = scene / "export_database" / "database.db"
+        if not database.is_file():
+            print(f"{image_set.name}: snakesfm left no database, so nothing runs on the same features")
+            return
+        with database.open("rb") as file:
+            inputs = hashlib.file_digest(file, "sha256").hexdigest()
+        for seed in seeds:
+            for method in peers:
+                result = replace(blank, method=method, seed=seed, inputs=inputs)
+                self._map(image_set, work, database, result, {})
+
+    def _map(self, image_set: ImageSet, work: Path, database: Path, result: Result, before: Costs) -> None:
+        folder = work / f"{result.method}-{result.setting}-{result.seed}"
+        calibrate = result.setting == OWN and not image_set.known
+
+        def run() -> Costs:
+            cost = methods.colmap_map(
+                OPERATIONS[result.method],
+                image_set,
+                database,
+                folder,
+                calibrate,
+                result.seed,
+                self.threads,
+                self.limit_s,
+            )
+            if not before:
+                return {"map": cost}
+            return {**before, "map": cost, "total": before["extract"] + before["match"] + cost}
+
+        self._measure(image_set, result, folder / "model", run)
+
+    def _taken_over(self, result: Result) -> bool:
+        stored = result.stored(self.results)
+        return stored is not None and (stored.undisturbed or not self.retime)
+
+    def _measure(self, image_set: ImageSet, result: Result, model: Path, run: Callable[[], Costs]) -> None:
+        """Run, evaluate and store, unless that is stored already; a failure is stored too."""
+        if self._taken_over(result):
+            return
+        result = replace(result, date=datetime.now(UTC).strftime("%Y-%m-%d"))
+        try:
+            result = replace(result, stages=run())
+            result = replace(result, metrics=evaluate(model, image_set.reference))
+        except CommandError as error:
+            result = replace(result, failure=str(error), stages={"failed": error.cost})
+        except Exception as error:
+            traceback.print_exc()
+            result = replace(result, failure=f"{type(error).__name__}: {error}")
+        _report(result).write(self.results)
+
+
+def _report(result: Result) -> Result:
+    """Say in one line how a run ended."""
+    if result.failure:
+        text = result.failure
+    else:
+        areas = [f"{result.metrics[f'relative_pose_auc_{degrees}deg']:.1f}" for degrees in (1, 3, 5)]
+        text = f"{result.metrics['registered_images']} of {result.images} images, AUC {'/'.join(areas)}, "
+        text += ", ".join(f"{name} {cost.seconds:.1f} s" for name, cost in result.stages.items())
+        text += "" if result.undisturbed else " (disturbed)"
+    print(f"{result.image_set} {result.method} {result.setting} seed {result.seed}: {text}", flush=True)
+    return result
+
+
+def source_digest() -> str:
+    """Digest of all of snakesfm that decides what the workflow computes."""
+    digest = hashlib.sha256()
+    for file in _source_files():
+        digest.update(file.relative_to(ROOT).as_posix().encode() + b"\0" + file.read_bytes())
+    return digest.hexdigest()
+
+
+def _source_files() -> Iterator[Path]:
+    for name in SOURCES:
+        path = ROOT / name
+        yield from [path] if path.is_file() else sorted(path.rglob("*.py")) + sorted(path.rglob("*.smk"))

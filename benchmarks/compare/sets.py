@@ -1,0 +1,94 @@
+"""Image sets with reference poses: a folder with images/, reference/ and meta.yaml."""
+
+from collections import defaultdict
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from snakesfm.errors import ConfigError
+from snakesfm.evaluation.colmap_model import read_model
+
+IMAGE_SUFFIXES = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp"}
+
+
+@dataclass(frozen=True)
+class ImageSet:
+    """One set; are its intrinsics given to everyone, and is its reference surveyed truth?"""
+
+    folder: Path
+    known: bool
+    truth: bool
+
+    @property
+    def name(self) -> str:
+        """The folder's name."""
+        return self.folder.name
+
+    @property
+    def images(self) -> Path:
+        """The folder of images."""
+        return self.folder / "images"
+
+    @property
+    def reference(self) -> Path:
+        """The folder of the reference model."""
+        return self.folder / "reference"
+
+    def image_names(self) -> list[str]:
+        """Paths of all images relative to their folder, sorted."""
+        files = (path for path in self.images.rglob("*") if path.suffix.lower() in IMAGE_SUFFIXES)
+        return sorted(path.relative_to(self.images).as_posix() for path in files)
+
+    def camera_groups(self) -> list[dict[str, Any]]:
+        """What COLMAP is told of the cameras: each group's images, mode and known intrinsics.
+
+        Unknown intrinsics: one camera or one per image, as in the reference.
+        """
+        model = read_model(self.reference)
+        if not self.known:
+            single = len(model.cameras) == 1
+            return [{"names": [], "mode": "SINGLE" if single else "PER_IMAGE"}]
+        members = defaultdict(list)
+        for image in model.images.values():
+            members[image.camera_id].append(image.name)
+        groups = []
+        for key in sorted(members):
+            camera = model.cameras[key]
+            groups.append(
+                {
+                    "names": sorted(members[key]) if len(members) > 1 else [],
+                    "mode": "SINGLE",
+                    "model": camera.model_name,
+                    "params": camera.params.tolist(),
+                }
+            )
+        return groups
+
+    def pinhole(self) -> list[list[float]] | None:
+        """The 3x3 camera matrix where one known camera without distortion took all images."""
+        cameras = list(read_model(self.reference).cameras.values())
+        if not self.known or len(cameras) != 1 or not cameras[0].is_undistorted():
+            return None
+        matrix: list[list[float]] = cameras[0].calibration_matrix().tolist()
+        return matrix
+
+
+def read_sets(data: Path, names: list[str]) -> list[ImageSet]:
+    """The named sets below ``data``, or all of them, smallest first.
+
+    Raises
+    ------
+    ConfigError : a set is not there.
+    """
+    folders = [data / name for name in names] or sorted(path.parent for path in data.glob("*/reference"))
+    sets = []
+    for folder in folders:
+        if not (folder / "images").is_dir() or not (folder / "reference").is_dir():
+            raise ConfigError(f"{folder} is no image set: it needs images/ and reference/.")
+        meta = folder / "meta.yaml"
+        content = yaml.safe_load(meta.read_text("utf-8")) if meta.is_file() else {}
+        truth = "colmap" not in content.get("reference_source", "colmap")
+        sets.append(ImageSet(folder.resolve(), bool(content.get("known_intrinsics", False)), truth))
+    return sorted(sets, key=lambda item: (len(item.image_names()), item.name))

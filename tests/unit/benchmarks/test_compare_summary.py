@@ -1,0 +1,165 @@
+"""The comparison's medians, ratios and tables, on results made up for it."""
+
+import csv
+import io
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from benchmarks.compare.ablate import DEFAULT, read_ablations, render_ablations
+from benchmarks.compare.measure import Cost
+from benchmarks.compare.methods import stage_costs
+from benchmarks.compare.results import GLOBAL, INCREMENTAL, OURS, OWN, SAME, Result, read_results
+from benchmarks.compare.summary import COLUMNS, best_peer, gap, group, ratios, speed, spread, tally
+from benchmarks.compare.tables import render_csv, render_page
+from snakesfm.errors import ConfigError
+
+AREA = "relative_pose_auc_1deg"
+BLANK = Result("castle", 30, True, True, OURS, OWN, 0, date="2026-01-02")
+
+
+def column(key: str):
+    return next(item for item in COLUMNS if item.key == key)
+
+
+def result(method: str, seed: int, area: float, seconds: float, setting: str = OWN, others: float = 0.0):
+    cost = Cost(seconds, 2 * seconds, 100.0 + seed, others)
+    stages = {"map": cost} if setting == SAME else {"extract": cost, "map": cost, "total": cost + cost}
+    metrics = {AREA: area, "registered_images": 30, "position_error_median": 0.01 * seconds}
+    return replace(BLANK, method=method, seed=seed, setting=setting, metrics=metrics, stages=stages)
+
+
+@pytest.fixture
+def results() -> list[Result]:
+    ours = [result(OURS, seed, area, 2.0) for seed, area in enumerate((90.0, 92.0, 91.0))]
+    incremental = [result(INCREMENTAL, seed, 80.0 + seed, 16.0) for seed in range(3)]
+    glomap = [result(GLOBAL, seed, 88.0, 5.0) for seed in range(2)]
+    glomap.append(replace(BLANK, method=GLOBAL, seed=2, failure="crashed by SIGSEGV"))
+    return [*ours, *incremental, *glomap]
+
+
+def test_median_and_spread_over_seeds(results: list[Result]) -> None:
+    found = spread(column(AREA), [item for item in results if item.method == OURS])
+    assert (found.median, found.least, found.greatest) == (91.0, 90.0, 92.0)
+
+
+def test_a_run_without_a_model_counts_as_nothing_in_accuracy_and_not_in_time(results: list[Result]) -> None:
+    runs = [item for item in results if item.method == GLOBAL]
+    assert (spread(column(AREA), runs).least, spread(column(AREA), runs).median) == (0.0, 88.0)
+    assert spread(column("total_seconds"), runs).median == 10.0
+    assert spread(column("position_error_median"), runs).median == pytest.approx(0.05)
+
+
+def test_ratios_are_to_the_better_peer_and_above_one_where_snakesfm_is_better(
+    results: list[Result],
+) -> None:
+    groups = group(results)
+    assert best_peer(column(AREA), groups, "castle", OWN) == 88.0
+    assert best_peer(column("total_seconds"), groups, "castle", OWN) == 10.0
+    found = ratios(groups, "castle", OWN)
+    assert found[AREA] == pytest.approx(91.0 / 88.0)
+    assert found["total_seconds"] == pytest.approx(2.5)
+    assert found["position_error_median"] == pytest.approx(2.5)
+    assert found["points"] is None
+    assert gap(AREA, groups, "castle", OWN) == pytest.approx(3.0)
+    assert gap(AREA, groups, "castle", SAME) is None
+    assert speed("total_seconds", groups, "castle", OWN, INCREMENTAL) == (pytest.approx(8.0), False)
+
+
+def test_disturbed_timings_count_only_where_there_are_no_others() -> None:
+    calm, loud = result(OURS, 0, 90.0, 2.0), result(OURS, 1, 90.0, 9.0, others=0.5)
+    seconds = column("total_seconds")
+    assert (spread(seconds, [calm, loud]).median, spread(seconds, [calm, loud]).disturbed) == (4.0, False)
+    assert (spread(seconds, [loud]).median, spread(seconds, [loud]).disturbed) == (18.0, True)
+    assert spread(column(AREA), [calm, loud]).least == 90.0
+
+
+def test_tally_calls_small_differences_equal() -> None:
+    assert tally([0.2, 0.05, -0.1, -0.3, None]) == {"better": 1, "equal": 2, "worse": 1}
+
+
+def test_snakesfm_takes_part_on_the_same_features_with_its_mapping(
+    tmp_path: Path, results: list[Result]
+) -> None:
+    for item in results:
+        item.write(tmp_path)
+    assert results[0].stored(tmp_path) == results[0]
+    assert replace(results[0], inputs="other").stored(tmp_path) is None
+    read = read_results(tmp_path)
+    shared = [item for item in read if item.setting == SAME]
+    assert len(read) == len(results) + 3
+    assert {item.method for item in shared} == {OURS}
+    assert all(set(item.stages) == {"map"} for item in shared)
+
+
+def test_page_and_csv_hold_what_was_measured(results: list[Result]) -> None:
+    shared = [replace(item, setting=SAME) for item in results if item.method == OURS]
+    peers = [result(GLOBAL, seed, 93.0, 1.0, SAME) for seed in range(3)]
+    page = render_page([*results, *shared, *peers], {"cores": "2"}, "compare --seeds 3")
+    assert "Measured 2026-01-02 with `compare --seeds 3`\non cores 2." in page
+    (line,) = [line for line in page.splitlines() if line.startswith("| castle* |")]
+    cells = [cell.strip() for cell in line.split("|")[1:-1]]
+    assert cells[1] == "+3.00"
+    assert cells[5:7] == ["8.0x", "2.5x"]
+    assert cells[8] == "-2.00"
+    assert cells[12] == "0.5x"
+    assert "| snakesfm | 30 | 91.00 (90.00..92.00) |" in page
+    assert "colmap_global: 1 of 3 runs without a model (crashed by SIGSEGV)." in page
+    rows = list(csv.DictReader(io.StringIO(render_csv(results))))
+    assert len(rows) == len(results)
+    assert {row["failure"] for row in rows} == {"", "crashed by SIGSEGV"}
+    assert float(rows[0][AREA]) == 90.0
+
+
+def test_stage_costs_are_read_from_the_last_run_in_the_logs(tmp_path: Path) -> None:
+    def log(stage: str, *lines: str) -> None:
+        file = tmp_path / "logs" / stage / "job.log"
+        file.parent.mkdir(parents=True)
+        file.write_text("".join(f"2026-01-02T10:{line}\n" for line in lines))
+
+    log(
+        "index_images",
+        "00:00.000 index_images out/index.h5",
+        "00:01.000 index_images done in 1.00 s, 0.50 s of processor time",
+        "10:00.000 index_images out/index.h5",
+        "10:02.000 index_images done in 2.00 s, 1.50 s of processor time",
+    )
+    log(
+        "match_pairs",
+        "10:03.000 match_pairs out/0-0.h5",
+        "10:09.500 match_pairs done in 6.50 s, 6.00 s of processor time",
+    )
+    log(
+        "adjust_bundle",
+        "10:10.000 adjust_bundle out/reconstruction.h5",
+        "10:12.000 adjust_bundle done in 2.00 s, 1.75 s of processor time",
+    )
+    costs = stage_costs(tmp_path / "logs", Cost(20.0, 12.0, 300.0))
+    assert {name: (cost.seconds, cost.cpu_seconds) for name, cost in costs.items()} == {
+        "extract": (2.0, 1.5),
+        "match": (7.5, 6.0),
+        "map": (2.5, 1.75),
+    }
+
+
+def test_ablations_change_known_options_and_go_from_late_stages_to_early_ones(
+    root: Path, tmp_path: Path
+) -> None:
+    ablations = read_ablations(root / "benchmarks" / "ablations.yaml", [])
+    assert ablations[0].name == DEFAULT
+    places = [ablation.first_stage for ablation in ablations]
+    assert places == sorted(places, reverse=True)
+    file = tmp_path / "own.yaml"
+    file.write_text("slip: {adjust_bundle: {los: huber}}\n")
+    with pytest.raises(ConfigError, match=r"'slip': Unknown configuration key 'adjust_bundle\.los'"):
+        read_ablations(file, [])
+    with pytest.raises(ConfigError, match="has no 'nothing'"):
+        read_ablations(root / "benchmarks" / "ablations.yaml", ["nothing"])
+
+
+def test_table_of_ablations_shows_mean_changes() -> None:
+    areas = {"a|default": 90.0, "a|x": 91.0, "b|default": 50.0, "b|x": None}
+    page = render_ablations(areas, ["default", "x"], {"a": True, "b": False}, "2026-01-02")
+    assert "| x | -24.50 | +1.00 | 91.00 | failed |" in page
+    assert "| default |  |  | 90.00 | 50.00 |" in page
