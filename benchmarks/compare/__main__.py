@@ -39,7 +39,9 @@ def parse(arguments: list[str]) -> argparse.Namespace:
     run.add_argument("--seeds", type=int, default=3)
     run.add_argument("--large-seeds", type=int, default=3, help="seeds on sets above 60 images")
     run.add_argument("--methods", nargs="*", choices=METHODS, default=list(METHODS))
-    run.add_argument("--retime", action="store_true", help="repeat what others on the machine disturbed")
+    run.add_argument(
+        "--retime", action="store_true", help="repeat first seeds that others on the machine disturbed"
+    )
     switch.add_argument("--options", type=Path, default=ROOT / "benchmarks" / "ablations.yaml")
     switch.add_argument("--names", nargs="*", default=[], help="names of options in that file (all)")
     plain = arguments and arguments[0] not in (*COMMANDS, "-h", "--help")
@@ -71,7 +73,7 @@ def main(arguments: list[str]) -> int:
                 tuple(given.methods),
                 given.retime,
             )
-            command = "python -m benchmarks.compare " + shlex.join(arguments)
+            command = describe_command(given)
             for image_set in read_sets(given.data, given.sets):
                 campaign.run(image_set)
                 (given.out / "command.txt").write_text(command + "\n", "utf-8")
@@ -81,6 +83,16 @@ def main(arguments: list[str]) -> int:
         sys.stderr.write(f"{error}\n")
         return 1
     return 0
+
+
+def describe_command(given: argparse.Namespace) -> str:
+    """The command that made the results, with names in the place of this machine's folders."""
+    parts = ["python -m benchmarks.compare --data DATA --out OUT"]
+    parts += [f"--sets {shlex.join(given.sets)}"] if given.sets else []
+    parts += [f"--seeds {given.seeds} --large-seeds {given.large_seeds} --threads {given.threads}"]
+    parts += [f"--methods {shlex.join(given.methods)}"] if set(given.methods) != set(METHODS) else []
+    parts += ["--retime"] if given.retime else []
+    return " ".join(parts)
 
 
 def write_tables(folder: Path, page: Path | None) -> None:

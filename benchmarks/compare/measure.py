@@ -3,6 +3,7 @@
 import contextlib
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -16,6 +17,7 @@ import psutil
 
 ROOT = Path(__file__).resolve().parents[2]
 SAMPLE_S = 0.2
+FOLDERS = re.compile(r"(?:/[^\s/]+)+/")
 UNDISTURBED = 0.05
 
 
@@ -107,7 +109,7 @@ def run_measured(command: list[str], folder: Path, log: Path, limit_s: float) ->
     if process.returncode:
         lines = [line.strip() for line in log.read_text("utf-8", errors="replace").splitlines()]
         said = next((line for line in reversed(lines) if line), "no message")
-        raise CommandError(f"failed: {said[:200]}", cost)
+        raise CommandError(f"failed: {FOLDERS.sub('', said)[:200]}", cost)
     return cost
 
 

@@ -33,7 +33,7 @@ class Campaign:
     threads : of every method.
     limit_s : longest time of one command.
     chosen : methods to run.
-    retime : make again what was measured while others used the processor.
+    retime : make the first seed again where it was measured while others used the processor.
     """
 
     folder: Path
@@ -161,7 +161,7 @@ class Campaign:
 
     def _taken_over(self, result: Result) -> bool:
         stored = result.stored(self.results)
-        return stored is not None and (stored.undisturbed or not self.retime)
+        return stored is not None and (stored.undisturbed or not self.retime or result.seed > 0)
 
     def _measure(self, image_set: ImageSet, result: Result, model: Path, run: Callable[[], Costs]) -> None:
         """Run, evaluate and store, unless that is stored already; a failure is stored too."""

@@ -98,7 +98,9 @@ class Run:
         try:
             summary = json.loads(path.read_text("utf-8"))
         except (OSError, ValueError):
-            return f"snakesfm: scene '{scene.name}': no model yet."
+            database = Path(scene.database_file())
+            made = f"COLMAP database in {database}, " if database.is_file() else ""
+            return f"snakesfm: scene '{scene.name}': {made}no model yet."
         accuracy = ""
         with contextlib.suppress(OSError, ValueError, KeyError):
             metrics = json.loads((scene.folder / "evaluate_model" / "metrics.json").read_text("utf-8"))

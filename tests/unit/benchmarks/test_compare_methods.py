@@ -1,0 +1,97 @@
+"""The comparison's processes: what is measured of them, how they fail, and that COLMAP's mappers run."""
+
+import sys
+from pathlib import Path
+
+import pycolmap
+import pytest
+
+from benchmarks.compare.measure import CommandError, run_measured, run_operation
+from benchmarks.compare.methods import colmap_map
+from benchmarks.compare.results import evaluate
+from benchmarks.compare.sets import ImageSet, read_sets
+from snakesfm.errors import ConfigError
+
+IMAGES = 6
+
+
+def measured(folder: Path, code: str, limit_s: float = 60.0):
+    return run_measured([sys.executable, "-c", code], folder, folder / "log", limit_s)
+
+
+def test_processor_time_and_memory_of_children_count(tmp_path: Path) -> None:
+    inner = "x = bytearray(120 * 2**20); sum(range(3 * 10**7))"
+    code = f"import subprocess, sys; subprocess.run([sys.executable, '-c', {inner!r}])"
+    cost = measured(tmp_path, code)
+    assert 110.0 < cost.peak_mib < 400.0
+    assert 0.05 < cost.cpu_seconds < 60.0
+    assert 0.0 <= cost.others <= 1.0
+
+
+@pytest.mark.parametrize(
+    ("code", "limit_s", "reason"),
+    [
+        ("raise SystemExit('no /some/where/model was found')", 60.0, "failed: no model was found"),
+        ("import os; os.kill(os.getpid(), 11)", 60.0, "crashed by SIGSEGV"),
+        ("import time; time.sleep(60)", 0.5, "stopped at the limit of 0 s"),
+    ],
+)
+def test_failures_say_what_happened_and_what_it_cost(
+    tmp_path: Path, code: str, limit_s: float, reason: str
+) -> None:
+    with pytest.raises(CommandError) as error:
+        measured(tmp_path, code, limit_s)
+    assert str(error.value) == reason
+    assert error.value.cost.seconds > 0
+
+
+def test_an_operation_that_does_not_exist_fails(tmp_path: Path) -> None:
+    with pytest.raises(CommandError, match="KeyError: 'paint'"):
+        run_operation("paint", {}, tmp_path / "log", 60.0)
+
+
+@pytest.fixture(scope="module")
+def synthetic(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A set of COLMAP's own making, with a database; its images are not needed."""
+    folder = tmp_path_factory.mktemp("sets") / "synthetic"
+    (folder / "images").mkdir(parents=True)
+    (folder / "reference").mkdir()
+    pycolmap.set_random_seed(1)
+    options = pycolmap.SyntheticDatasetOptions()
+    options.num_rigs, options.num_cameras_per_rig, options.num_frames_per_rig = 1, 1, IMAGES
+    options.num_points3D = 100
+    with pycolmap.Database.open(folder / "database.db") as database:
+        pycolmap.synthesize_dataset(options, database).write_text(folder / "reference")
+    (folder / "meta.yaml").write_text("known_intrinsics: true\nreference_source: gantry\n")
+    return folder
+
+
+@pytest.mark.parametrize("operation", ["map_incremental", "map_global"])
+def test_colmaps_mappers_run_on_a_copy_of_a_database(
+    synthetic: Path, tmp_path: Path, operation: str
+) -> None:
+    (image_set,) = read_sets(synthetic.parent, ["synthetic"])
+    assert (image_set.known, image_set.truth) == (True, True)
+    database = synthetic / "database.db"
+    before = database.read_bytes()
+    cost = colmap_map(operation, image_set, database, tmp_path / "run", False, 0, 1, 120.0)
+    assert database.read_bytes() == before
+    assert not (tmp_path / "run" / "database.db").exists()
+    assert cost.cpu_seconds > 0
+    metrics = evaluate(tmp_path / "run" / "model", image_set.reference)
+    assert metrics["registered_images"] == IMAGES
+    assert 99.0 < metrics["relative_pose_auc_1deg"] <= 100.0
+
+
+def test_cameras_are_told_as_the_reference_has_them(synthetic: Path) -> None:
+    (known,) = ImageSet(synthetic, True, True).camera_groups()
+    (camera,) = pycolmap.Reconstruction(synthetic / "reference").cameras.values()
+    assert (known["names"], known["mode"], known["model"]) == ([], "SINGLE", camera.model_name)
+    assert known["params"] == camera.params.tolist()
+    assert ImageSet(synthetic, False, True).camera_groups() == [{"names": [], "mode": "SINGLE"}]
+    assert ImageSet(synthetic, False, True).pinhole() is None
+
+
+def test_a_folder_that_is_no_set_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"lacking is no image set: it needs images/ and reference/"):
+        read_sets(tmp_path, ["lacking"])
