@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -94,6 +95,10 @@ def _measure(
     image_set: ImageSet, ablation: Ablation, out: Path, threads: int, limit_s: float
 ) -> dict[str, Any]:
     folder = out / "ablation" / image_set.name
+    compared = out / "work" / image_set.name / "snakesfm-0"
+    if compared.is_dir() and not folder.exists():
+        # what the comparison has made already; Snakemake re-makes what is not up to date
+        shutil.copytree(compared, folder, symlinks=True)
     metrics = folder / "out" / image_set.name / "evaluate_model" / "metrics.json"
     target = metrics.relative_to(folder).as_posix()
     try:
