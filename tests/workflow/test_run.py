@@ -12,6 +12,8 @@ import pycolmap
 import pytest
 from workflow_runner import copy_run, model_bytes
 
+from benchmarks.compare.measure import Cost
+from benchmarks.compare.methods import stage_costs
 from snakesfm.artifacts import Reconstruction
 from snakesfm.config.configuration import STAGES
 
@@ -203,3 +205,11 @@ def test_the_database_is_made_by_its_own_target_alone(finished, small_scene: Pat
     assert database.num_images() == database.num_frames() == 16
     assert database.num_verified_image_pairs() > 30
     database.close()
+
+
+def test_logs_say_what_the_jobs_cost(finished) -> None:
+    costs = stage_costs(finished[0] / "logs", Cost(600.0, 600.0, 0.0))
+    for name in ("extract", "match", "map"):
+        assert 0.0 < costs[name].seconds < 600.0
+        assert 0.0 < costs[name].cpu_seconds < 600.0
+        assert 20.0 < costs[name].peak_mib < 4000.0
