@@ -12,7 +12,7 @@ from pathlib import Path
 
 from benchmarks.compare.measure import ROOT, Cost, run_measured, run_operation
 from benchmarks.compare.sets import ImageSet
-from snakesfm.artifacts import ImageIndex, PairMatches
+from snakesfm.artifacts import ImageIndex, TwoViewGeometries
 
 FEATURES = 5000
 EXTRACT = (
@@ -107,16 +107,19 @@ def _clock(text: str) -> float:
     return datetime.fromisoformat(text).timestamp()
 
 
-def write_pairs(scene: Path, path: Path, least_matches: int) -> int:
-    """List the pairs of a finished snakesfm run that have ``least_matches`` or more; how many there are."""
+def write_pairs(scene: Path, path: Path, least_inliers: int) -> int:
+    """List the pairs of a finished snakesfm run with ``least_inliers`` or more; how many there are.
+
+    Raises
+    ------
+    ArtifactError : the run is not finished.
+    """
     names = ImageIndex.read(scene / "index_images" / "index.h5").names
     lines = []
-    for file in sorted((scene / "match_pairs").glob("*.h5")):
-        with PairMatches.open(file) as tile:
-            offsets = tile["offsets"][()].tolist()
-            for row, (i, j) in enumerate(tile["pairs"][()].tolist()):
-                if offsets[row + 1] - offsets[row] >= least_matches:
-                    lines.append(f"{names[i]} {names[j]}\n")
+    for file in sorted((scene / "estimate_two_view").glob("*.h5")):
+        with TwoViewGeometries.open(file) as tile:
+            enough = tile["inlier_counts"][()] >= least_inliers
+            lines += [f"{names[i]} {names[j]}\n" for i, j in tile["pairs"][()][enough].tolist()]
     path.write_text("".join(lines), "utf-8")
     return len(lines)
 

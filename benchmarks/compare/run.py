@@ -14,10 +14,11 @@ from benchmarks.compare import methods
 from benchmarks.compare.measure import ROOT, CommandError, Cost
 from benchmarks.compare.results import GLOBAL, INCREMENTAL, OPENMVG, OURS, OWN, SAME, Result, evaluate
 from benchmarks.compare.sets import ImageSet
+from snakesfm.errors import SnakesfmError
 
 OPERATIONS = {INCREMENTAL: "map_incremental", GLOBAL: "map_global"}
 LARGE_SET = 60
-PAIR_MATCHES = 30
+PAIR_INLIERS = 15  # what COLMAP asks of a pair
 SOURCES = ("Snakefile", "config.yaml", "scripts", "workflow/rules", "src/snakesfm")
 Costs = dict[str, Cost]
 
@@ -62,27 +63,11 @@ class Campaign:
         scene = work / "snakesfm-0" / "out" / image_set.name
         peers = [method for method in OPERATIONS if method in self.chosen]
         if peers:
-            note, pairs = "", ""
-            if large:
-                with contextlib.suppress(FileNotFoundError):
-                    count = methods.write_pairs(scene, work / "pairs.txt", PAIR_MATCHES)
-                    pairs = str(work / "pairs.txt")
-                    note = f"{count} of {images * (images - 1) // 2} pairs: those with at least "
-                    note += f"{PAIR_MATCHES} matches in snakesfm"
-            self._run_own(image_set, work, replace(blank, setting=OWN, note=note), peers, seeds, pairs)
+            self._run_own(image_set, work, scene, replace(blank, setting=OWN), peers, seeds, large)
             self._run_same(image_set, work, scene, replace(blank, setting=SAME), peers, seeds)
         if OPENMVG in self.chosen:
             for seed in seeds:
-                result = replace(
-                    blank, method=OPENMVG, setting=OWN, seed=seed, inputs=version("openmvg-rs")
-                )
-                folder = work / f"openmvg-{seed}"
-
-                def run(folder: Path = folder, seed: int = seed) -> Costs:
-                    cost = methods.openmvg(image_set, folder, seed, self.threads, self.limit_s)
-                    return {"total": cost}
-
-                self._measure(image_set, result, folder / "model", run)
+                self._run_openmvg(image_set, work, replace(blank, method=OPENMVG, setting=OWN, seed=seed))
 
     def _run_ours(self, image_set: ImageSet, work: Path, result: Result) -> None:
         """Snakesfm from images to model; of the first seed the database too, beside the measurement."""
@@ -103,25 +88,54 @@ class Campaign:
                 shutil.rmtree(scene / stage, ignore_errors=True)
 
     def _run_own(
-        self, image_set: ImageSet, work: Path, blank: Result, peers: list[str], seeds: range, pairs: str
+        self,
+        image_set: ImageSet,
+        work: Path,
+        scene: Path,
+        blank: Result,
+        peers: list[str],
+        seeds: range,
+        large: bool,
     ) -> None:
         """COLMAP's mappers after its own front-end, which they share."""
         front = work / "colmap"
+        pairs = work / "pairs.txt" if large else None
+        if pairs is not None:
+            try:
+                # kept when snakesfm changes, as the front-end is that was run with it
+                count = count_lines(pairs) or methods.write_pairs(scene, pairs, PAIR_INLIERS)
+            except SnakesfmError as error:
+                print(f"{image_set.name}: COLMAP's front-end has no list of pairs: {error}")
+                return
+            possible = blank.images * (blank.images - 1) // 2
+            note = f"{count} of {possible} pairs: those with at least {PAIR_INLIERS} inliers in snakesfm"
+            blank = replace(blank, note=note)
         inputs = version("pycolmap") + blank.note
         runs = [replace(blank, method=m, seed=s, inputs=inputs) for s in seeds for m in peers]
         if all(self._taken_over(result) for result in runs):
             return
         try:
-            costs = methods.colmap_front_end(image_set, front, pairs, self.threads, self.limit_s)
+            costs = methods.colmap_front_end(image_set, front, str(pairs or ""), self.threads, self.limit_s)
             if self.retime and not all(cost.undisturbed for cost in costs.values()):
                 (front / "cost.json").unlink()
-                costs = methods.colmap_front_end(image_set, front, pairs, self.threads, self.limit_s)
+                costs = methods.colmap_front_end(
+                    image_set, front, str(pairs or ""), self.threads, self.limit_s
+                )
         except CommandError as error:
             for result in runs:
                 _report(replace(result, failure=f"front-end {error}")).write(self.results)
             return
         for result in runs:
             self._map(image_set, work, front / "database.db", result, costs)
+
+    def _run_openmvg(self, image_set: ImageSet, work: Path, result: Result) -> None:
+        """OpenMVG from images to model."""
+        folder = work / f"openmvg-{result.seed}"
+
+        def run() -> Costs:
+            return {"total": methods.openmvg(image_set, folder, result.seed, self.threads, self.limit_s)}
+
+        self._measure(image_set, replace(result, inputs=version("openmvg-rs")), folder / "model", run)
 
     def _run_same(
         self, image_set: ImageSet, work: Path, scene: Path, blank: Result, peers: list[str], seeds: range
@@ -190,6 +204,11 @@ def _report(result: Result) -> Result:
         text += "" if result.undisturbed else " (disturbed)"
     print(f"{result.image_set} {result.method} {result.setting} seed {result.seed}: {text}", flush=True)
     return result
+
+
+def count_lines(path: Path) -> int:
+    """Lines of a text file; 0 where there is none."""
+    return len(path.read_text("utf-8").splitlines()) if path.is_file() else 0
 
 
 def source_digest() -> str:

@@ -22,7 +22,7 @@ from benchmarks.compare.results import (
     SETTINGS,
     Result,
 )
-from benchmarks.compare.run import LARGE_SET, PAIR_MATCHES
+from benchmarks.compare.run import LARGE_SET, PAIR_INLIERS
 from benchmarks.compare.summary import (
     ACCURACY,
     COLUMNS,
@@ -122,7 +122,7 @@ def render_page(results: Sequence[Result], machine: Mapping[str, str], command: 
 def _explanation() -> list[str]:
     return [
         f"**(a)** every method with its own front-end, {FEATURES} features an image (openMVG: its own number), all "
-        f"pairs; on sets above {LARGE_SET} images COLMAP is given only the pairs with at least {PAIR_MATCHES} matches "
+        f"pairs; on sets above {LARGE_SET} images COLMAP is given only the pairs with at least {PAIR_INLIERS} inliers "
         "in snakesfm, which spares it time. **(b)** COLMAP's mappers on the database that snakesfm exports "
         "(`export_database`): the same features, pairs and two-view geometries.",
         "",
@@ -179,8 +179,9 @@ def _summary(sets: Mapping[str, Result], groups: Mapping[Key, list[Result]]) -> 
         ):
             counts = []
             for key, title in zip(AREAS, ("@1", "@3", "@5"), strict=True):
-                found = tally(gap(key, groups, name, setting) for name in chosen)
-                counts.append(f"{title} {found['better']} / {found['equal']} / {found['worse']}")
+                counted = tally(gap(key, groups, name, setting) for name in chosen)
+                parts = (counted[name] for name in ("better", "equal", "worse"))
+                counts.append(f"{title} {' / '.join(map(str, parts))}")
             lines.append(
                 f"- {TITLES[setting]}, {label}: better / equal (within {TIE}) / worse in AUC: {', '.join(counts)}."
             )
