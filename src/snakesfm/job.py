@@ -6,14 +6,41 @@ import os
 import sys
 import time
 import traceback
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
-def run_job(stage: str, snakemake: Any) -> None:
-    """Run one stage as a Snakemake job.
+@dataclass(frozen=True)
+class Call:
+    """What Snakemake tells a job.
+
+    Parameters
+    ----------
+    stage : verb_noun name of the stage.
+    params : ``options``, ``stage_version``, ``settings`` and ``seed``.
+    files : ``scene``, ``inputs`` by name and ``outputs``.
+    threads : how many threads may be used.
+    log : the job's log.
+    """
+
+    stage: str
+    params: dict[str, Any]
+    files: dict[str, Any]
+    threads: int
+    log: Path
+
+    @classmethod
+    def parse(cls, stage: str, text: str) -> "Call":
+        """From the lines that the rule's command gives: params, files, threads, and the log's name."""
+        params, files, threads, log = text.removesuffix("\n").split("\n", 3)
+        return cls(stage, json.loads(params), json.loads(files), int(threads), Path(log))
+
+
+def run_job(stage: str) -> None:
+    """Run one stage as the Snakemake job that standard input describes.
 
     Standard output and error of this process, C++ libraries included, go to the job's log; progress and the
     one sentence of an error go to the terminal too.
@@ -21,20 +48,20 @@ def run_job(stage: str, snakemake: Any) -> None:
     Parameters
     ----------
     stage : verb_noun name of the stage.
-    snakemake : the object that Snakemake gives to a script.
     """
     for variable in THREAD_VARIABLES:
         os.environ[variable] = "1"
-    terminal = _redirect_to_log(Path(snakemake.log[0]))
+    call = Call.parse(stage, sys.stdin.buffer.read().decode("utf-8"))
+    terminal = _redirect_to_log(call.log)
     try:
-        job = _bind(stage, snakemake, terminal)
+        job = _bind(call, terminal)
         module = importlib.import_module(f"snakesfm.stages.{stage}")
         started, before = time.time(), _processor_seconds()
         print(f"{_clock(started)} {stage} {job.output}", flush=True)
         module.run(job)
         _keep_former(job, module)
     except Exception as error:
-        _fail(stage, snakemake, error, terminal)
+        _fail(call, error, terminal)
     ended = time.time()
     print(
         f"{_clock(ended)} {stage} done in {ended - started:.2f} s, "
@@ -67,26 +94,23 @@ def _redirect_to_log(path: Path) -> Any:
     return terminal
 
 
-def _bind(stage: str, snakemake: Any, terminal: Any) -> Any:
+def _bind(call: Call, terminal: Any) -> Any:
     """The StageJob of a Snakemake job."""
     from snakesfm.stages.job import JobOptions, Progress, StageJob
 
-    content = json.loads(snakemake.params.job)
-    outputs = tuple(Path(path) for path in snakemake.output)
+    params = call.params
+    outputs = tuple(Path(path) for path in call.files["outputs"])
     former = former_path(outputs[0])
     Progress.terminal = terminal
     return StageJob(
-        stage=stage,
-        scene=snakemake.wildcards.scene,
-        inputs={
-            name: value if isinstance(value, str) else list(value)
-            for name, value in snakemake.input.items()
-        },
+        stage=call.stage,
+        scene=call.files["scene"],
+        inputs=call.files["inputs"],
         outputs=outputs,
-        options=JobOptions(content["options"], content["stage_version"]),
-        settings=content["settings"],
-        seed=content["seed"],
-        threads=snakemake.threads,
+        options=JobOptions(params["options"], params["stage_version"]),
+        settings=params["settings"],
+        seed=params["seed"],
+        threads=call.threads,
         former=former if former.is_file() else None,
     )
 
@@ -110,11 +134,10 @@ def _keep_former(job: Any, module: Any) -> None:
         print(f"warning: {former} could not be kept ({error}); a re-run computes everything anew.")
 
 
-def _fail(stage: str, snakemake: Any, error: Exception, terminal: Any) -> None:
+def _fail(call: Call, error: Exception, terminal: Any) -> None:
     """Say what went wrong, in the log and on the terminal, and end with exit status 1."""
     from snakesfm.errors import SnakesfmError
 
-    scene = snakemake.wildcards.scene
     if isinstance(error, SnakesfmError):
         sentence = str(error)
     elif isinstance(error, OSError) and error.strerror:
@@ -126,8 +149,9 @@ def _fail(stage: str, snakemake: Any, error: Exception, terminal: Any) -> None:
         traceback.print_exc()
     else:
         traceback.print_exc()
-        sentence = f"Unexpected {type(error).__name__}: {error}; {snakemake.log[0]} holds the details."
+        sentence = f"Unexpected {type(error).__name__}: {error}; {call.log} holds the details."
     print(f"error: {sentence}", flush=True)
-    print(f"snakesfm: scene '{scene}', {stage}: {sentence}", file=terminal, flush=True)
+    scene = call.files["scene"]
+    print(f"snakesfm: scene '{scene}', {call.stage}: {sentence}", file=terminal, flush=True)
     sys.stdout.flush()
     sys.exit(1)

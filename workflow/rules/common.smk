@@ -1,8 +1,12 @@
 # Names, input functions and the start and end of a run. No rules here.
 
+import json
 import re
+import shlex
+import sys
 
 from snakemake.exceptions import WorkflowError
+from snakemake.settings.types import DeploymentMethod
 
 from snakesfm.errors import SnakesfmError
 from snakesfm.plan import Plan, tile_names
@@ -13,6 +17,14 @@ try:
 except SnakesfmError as error:
     raise WorkflowError(str(error)) from None
 RUN = Run(PLAN)
+
+IN_CONTAINER = (
+    DeploymentMethod.APPTAINER in workflow.deployment_settings.deployment_method
+)
+# a rule with more outputs has a stage that can name them itself: Snakemake keeps the command with each output
+MOST_LISTED_OUTPUTS = 16
+# freed images stay with the process, in huge pages: glibc would give them back, and each page is cleared anew
+MALLOC = "MALLOC_MMAP_THRESHOLD_=33554432 MALLOC_TRIM_THRESHOLD_=1073741824 GLIBC_TUNABLES=glibc.malloc.hugetlb=1"
 
 
 wildcard_constraints:
@@ -71,6 +83,35 @@ def job_params(stage):
         return scene.params(stage, wildcards, workflow.is_main_process)
 
     return render
+
+
+def job_files():
+    """A params function: the JSON that tells a job its scene and files; Snakemake tracks it by the files alone."""
+
+    def render(wildcards, input, output):
+        call = {
+            "scene": wildcards.scene,
+            "inputs": {
+                name: value if isinstance(value, str) else list(value)
+                for name, value in input.items()
+            },
+            "outputs": list(output)[:MOST_LISTED_OUTPUTS],
+        }
+        return json.dumps(call)
+
+    return render
+
+
+def job_command(stage):
+    """The shell command of a job: its script, which reads from standard input what it needs to know.
+
+    A here-document is no argument, so it holds any number of files, and its quoted mark keeps the shell from
+    changing a character of it.
+    """
+    python = "python" if IN_CONTAINER else shlex.quote(sys.executable)
+    script = shlex.quote(f"{workflow.basedir}/scripts/{stage}.py")
+    command = f"{MALLOC} exec {python} {script}".replace("{", "{{").replace("}", "}}")
+    return f"{command} <<'END OF JOB'\n{{params.job}}\n{{params.files}}\n{{threads}}\n{{log}}\nEND OF JOB\n"
 
 
 def all_files():

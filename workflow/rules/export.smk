@@ -40,8 +40,9 @@ rule export_model:
         benchmark_file("export_model")
     params:
         job=job_params("export_model"),
-    script:
-        "../../scripts/export_model.py"
+        files=job_files(),
+    shell:
+        job_command("export_model")
 
 
 rule evaluate_model:
@@ -57,5 +58,6 @@ rule evaluate_model:
         benchmark_file("evaluate_model")
     params:
         job=job_params("evaluate_model"),
-    script:
-        "../../scripts/evaluate_model.py"
+        files=job_files(),
+    shell:
+        job_command("evaluate_model")

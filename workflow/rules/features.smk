@@ -12,8 +12,9 @@ rule extract_features:
         benchmark_file("extract_features", "{block}")
     params:
         job=job_params("extract_features"),
-    script:
-        "../../scripts/extract_features.py"
+        files=job_files(),
+    shell:
+        job_command("extract_features")
 
 
 rule learn_vocabulary:
@@ -27,8 +28,9 @@ rule learn_vocabulary:
         benchmark_file("learn_vocabulary")
     params:
         job=job_params("learn_vocabulary"),
-    script:
-        "../../scripts/learn_vocabulary.py"
+        files=job_files(),
+    shell:
+        job_command("learn_vocabulary")
 
 
 rule describe_images:
@@ -43,8 +45,9 @@ rule describe_images:
         benchmark_file("describe_images", "{block}")
     params:
         job=job_params("describe_images"),
-    script:
-        "../../scripts/describe_images.py"
+        files=job_files(),
+    shell:
+        job_command("describe_images")
 
 
 # the outputs of a rule cannot depend on the scene, so scenes with another number of blocks have their own rule
@@ -66,5 +69,6 @@ for blocks, scenes in PLAN.scenes_by_blocks().items():
             scene=any_of(scenes),
         params:
             job=job_params("select_pairs"),
-        script:
-            "../../scripts/select_pairs.py"
+            files=job_files(),
+        shell:
+            job_command("select_pairs")

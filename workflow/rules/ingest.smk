@@ -11,5 +11,6 @@ rule index_images:
     threads: 2
     params:
         job=job_params("index_images"),
-    script:
-        "../../scripts/index_images.py"
+        files=job_files(),
+    shell:
+        job_command("index_images")

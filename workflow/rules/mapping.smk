@@ -13,8 +13,9 @@ rule build_view_graph:
         benchmark_file("build_view_graph")
     params:
         job=job_params("build_view_graph"),
-    script:
-        "../../scripts/build_view_graph.py"
+        files=job_files(),
+    shell:
+        job_command("build_view_graph")
 
 
 rule filter_view_graph:
@@ -29,8 +30,9 @@ rule filter_view_graph:
         benchmark_file("filter_view_graph")
     params:
         job=job_params("filter_view_graph"),
-    script:
-        "../../scripts/filter_view_graph.py"
+        files=job_files(),
+    shell:
+        job_command("filter_view_graph")
 
 
 rule average_rotations:
@@ -45,8 +47,9 @@ rule average_rotations:
         benchmark_file("average_rotations")
     params:
         job=job_params("average_rotations"),
-    script:
-        "../../scripts/average_rotations.py"
+        files=job_files(),
+    shell:
+        job_command("average_rotations")
 
 
 rule build_tracks:
@@ -64,8 +67,9 @@ rule build_tracks:
         benchmark_file("build_tracks")
     params:
         job=job_params("build_tracks"),
-    script:
-        "../../scripts/build_tracks.py"
+        files=job_files(),
+    shell:
+        job_command("build_tracks")
 
 
 rule average_translations:
@@ -83,8 +87,9 @@ rule average_translations:
         benchmark_file("average_translations")
     params:
         job=job_params("average_translations"),
-    script:
-        "../../scripts/average_translations.py"
+        files=job_files(),
+    shell:
+        job_command("average_translations")
 
 
 rule triangulate_tracks:
@@ -102,8 +107,9 @@ rule triangulate_tracks:
         benchmark_file("triangulate_tracks")
     params:
         job=job_params("triangulate_tracks"),
-    script:
-        "../../scripts/triangulate_tracks.py"
+        files=job_files(),
+    shell:
+        job_command("triangulate_tracks")
 
 
 rule adjust_bundle:
@@ -124,5 +130,6 @@ rule adjust_bundle:
         benchmark_file("adjust_bundle")
     params:
         job=job_params("adjust_bundle"),
-    script:
-        "../../scripts/adjust_bundle.py"
+        files=job_files(),
+    shell:
+        job_command("adjust_bundle")

@@ -13,8 +13,9 @@ rule match_pairs:
         benchmark_file("match_pairs", "{tile}")
     params:
         job=job_params("match_pairs"),
-    script:
-        "../../scripts/match_pairs.py"
+        files=job_files(),
+    shell:
+        job_command("match_pairs")
 
 
 rule calibrate_cameras:
@@ -30,8 +31,9 @@ rule calibrate_cameras:
         benchmark_file("calibrate_cameras")
     params:
         job=job_params("calibrate_cameras"),
-    script:
-        "../../scripts/calibrate_cameras.py"
+        files=job_files(),
+    shell:
+        job_command("calibrate_cameras")
 
 
 rule estimate_two_view:
@@ -48,5 +50,6 @@ rule estimate_two_view:
         benchmark_file("estimate_two_view", "{tile}")
     params:
         job=job_params("estimate_two_view"),
-    script:
-        "../../scripts/estimate_two_view.py"
+        files=job_files(),
+    shell:
+        job_command("estimate_two_view")

@@ -20,5 +20,6 @@ rule render_report:
         benchmark_file("render_report")
     params:
         job=job_params("render_report"),
-    script:
-        "../../scripts/render_report.py"
+        files=job_files(),
+    shell:
+        job_command("render_report")
