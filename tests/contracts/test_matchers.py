@@ -36,7 +36,7 @@ class MatcherContract:
     @pytest.fixture
     def match(self):
         matcher = create_matcher(self.method, **self.options)
-        return lambda first, second: matcher.match(matcher.prepare(first), second)
+        return lambda first, second: matcher.match(matcher.prepare(first), matcher.prepare_second(second))
 
     def test_is_registered(self):
         assert self.method in MATCHERS
@@ -81,8 +81,10 @@ class MatcherContract:
         images = [keypoints(rootsift(histograms(count, 1))) for count in (500, 300, 700, 400)]
         prepared = matcher.prepare(images[0])
         for second in (*images, *images[::-1]):
-            expected = matcher.match(matcher.prepare(images[0]), second)
-            for one, other in zip(expected, matcher.match(prepared, second), strict=True):
+            expected = matcher.match(matcher.prepare(images[0]), matcher.prepare_second(second))
+            for one, other in zip(
+                expected, matcher.match(prepared, matcher.prepare_second(second)), strict=True
+            ):
                 np.testing.assert_array_equal(one, other)
 
     def test_is_deterministic(self, match):
@@ -107,7 +109,14 @@ class MutualRatioContract(MatcherContract):
         found = []
         for ratio in (0.7, 0.8, 0.9, 1.0):
             matcher = create_matcher("mutual_ratio", **self.options, max_ratio=ratio)
-            found.append(set(map(tuple, matcher.match(matcher.prepare(first), second)[0].tolist())))
+            found.append(
+                set(
+                    map(
+                        tuple,
+                        matcher.match(matcher.prepare(first), matcher.prepare_second(second))[0].tolist(),
+                    )
+                )
+            )
         assert found[0] < found[1] < found[2] < found[3]
 
 
@@ -124,7 +133,7 @@ class TestExactMutualRatio(MutualRatioContract):
         good = (ordered[:, 0] <= 0.8 * ordered[:, 1]) & (distance.argmin(axis=0)[nearest] == np.arange(613))
         matcher = create_matcher("mutual_ratio", search="exact", max_ratio=0.8)
         matches, scores = matcher.match(
-            matcher.prepare(keypoints(first)), keypoints(second.astype(np.uint8))
+            matcher.prepare(keypoints(first)), matcher.prepare_second(keypoints(second.astype(np.uint8)))
         )
         np.testing.assert_array_equal(matches[:, 0], np.flatnonzero(good))
         np.testing.assert_array_equal(matches[:, 1], nearest[good])

@@ -25,8 +25,8 @@ def rule_texts(root: Path) -> dict[str, str]:
     for file in sorted((root / "workflow" / "rules").glob("*.smk")):
         text = file.read_text()
         for match in re.finditer(r"^( *)rule ?(\w*):\n(.*?)(?=^\S|\Z)", text, re.M | re.S):
-            script = re.search(r"scripts/(\w+)\.py", match[3])
-            rules[match[2] or script[1]] = match[3]
+            command = re.search(r'job_command\("(\w+)"\)', match[3])
+            rules[match[2] or command[1]] = match[3]
     return rules
 
 
@@ -48,15 +48,15 @@ def test_rule_writes_to_the_folder_of_its_name_and_runs_its_script(root: Path, s
     text = rule_texts(root)[stage]
     output = re.search(r"output:\n(.*?)log:", text, re.S)[1]
     assert set(re.findall(r'artifact\(\s*"(\w+)"', output)) == {stage}
-    assert re.findall(r"scripts/(\w+)\.py", text) == [stage]
-    for directive in ("log_file", "benchmark_file", "job_params"):
+    assert text.count("files=job_files(),") == 1
+    for directive in ("log_file", "benchmark_file", "job_params", "job_command"):
         assert re.findall(rf'{directive}\("(\w+)"', text) == [stage]
 
 
 @pytest.mark.parametrize("stage", STAGES)
 def test_script_is_thin_and_stage_has_run(root: Path, stage: str) -> None:
     script = (root / "scripts" / f"{stage}.py").read_text()
-    assert f'run_job("{stage}", snakemake)' in script
+    assert f'run_job("{stage}")' in script
     assert len(script.splitlines()) <= 10
     tree = ast.parse((root / "src/snakesfm/stages" / f"{stage}.py").read_text())
     assert "run" in {node.name for node in tree.body if isinstance(node, ast.FunctionDef)}

@@ -10,7 +10,7 @@ from snakesfm.config.base import StageOptions
 class MatchPairsOptions(StageOptions):
     """How the descriptors of two images are matched."""
 
-    stage_version: ClassVar[int] = 2
+    stage_version: ClassVar[int] = 3
 
     method: Literal["mutual_ratio"] = "mutual_ratio"
     """Matcher: mutual nearest neighbours with the ratio test."""
@@ -26,3 +26,9 @@ class MatchPairsOptions(StageOptions):
 
     probes: float = Field(3.0, ge=1.0, le=256.0)
     """Words that a descriptor is compared with, on average over an image; more find more of the matches."""
+
+    preview_keypoints: int = Field(400, ge=0, le=10_000)
+    """Largest keypoints that are compared first, to leave pairs that share nothing (0: match all pairs)."""
+
+    min_likeness: float = Field(1.5, ge=0.0)
+    """Least resemblance of these keypoints in a pair that is matched; higher leaves more pairs out."""

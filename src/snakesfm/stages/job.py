@@ -53,7 +53,8 @@ class StageJob:
     stage : verb_noun name of the stage.
     scene : name of the scene.
     inputs : named inputs of the rule; a list where the rule gathers several files.
-    outputs : all files of the rule; ``output`` is the first, and the only one of most stages.
+    outputs : the files of the rule; ``output`` is the first, and the only one of most stages. A stage with
+        one file per tile gets only some of them and names the others itself.
     options : the stage's options: JobOptions in a job; the stage's options model will do as well.
     settings : what is no option but changes the result, such as the image folder or the number of blocks.
     seed : the run's seed.

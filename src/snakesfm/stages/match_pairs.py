@@ -1,5 +1,6 @@
 """Match the keypoints of the pairs of one tile."""
 
+import functools
 import hashlib
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
@@ -23,12 +24,15 @@ Matches = tuple[Array, Array]
 
 
 REUSES_FORMER = True
+COLUMNS = ("keypoints", "descriptors", "scores", "scales", "angles")
+# descriptors of so many images take 20 MB at 5,000 keypoints
+HELD_IMAGES = 32
 
 
 def run(job: StageJob) -> None:
     """Match pair after pair, taking over pairs whose images and options are unchanged; write PairMatches.
 
-    Two images' features are held at a time, whatever the size of the blocks.
+    The features of ``HELD_IMAGES`` images are held at a time, whatever the size of the blocks.
     """
     options: MatchPairsOptions = job.options
     pairs = ImagePairs.read(job.path("pairs")).pairs
@@ -37,24 +41,31 @@ def run(job: StageJob) -> None:
         features = FeatureFiles(job.paths("features"), stack)
         digests = [_digest(features.digests[i], features.digests[j], options) for i, j in pairs.tolist()]
         former = _read_former(job.former, set(digests))
-        progress = job.progress(len(pairs), "pairs")
-        results: list[Matches] = []
+        results = {row: former[digest] for row, digest in enumerate(digests) if digest in former}
+        reused = len(results)
+        progress = job.progress(len(pairs) - reused, "pairs")
+        read_second = functools.lru_cache(HELD_IMAGES)(lambda j: matcher.prepare_second(features.read(j)))
         held, first = -1, None
-        for (i, j), digest in zip(pairs.tolist(), digests, strict=True):
-            result = former.get(digest)
-            if result is None:
-                if first is None or i != held:
-                    held, first = i, matcher.prepare(features.read(i))
-                result = matcher.match(first, features.read(j))
-            results.append(result)
+        for row in _order(pairs, np.array([row for row in range(len(pairs)) if row not in results], int)):
+            i, j = pairs[row].tolist()
+            if i != held:
+                held, first = i, matcher.prepare(features.read(i))
+            results[row] = matcher.match(first, read_second(j))
             progress.step()
-    _collect(pairs, digests, results).write(job.output, job.header)
-    counts = [len(matches) for matches, _ in results]
-    reused = sum(digest in former for digest in digests)
+    matches = [results[row] for row in range(len(pairs))]
+    _collect(pairs, digests, matches).write(job.output, job.header)
+    counts = [len(rows) for rows, _ in matches]
     print(
         f"{len(pairs)} pairs ({reused} taken over), {sum(counts)} matches, "
-        f"median {int(np.median(counts)) if counts else 0} per pair"
+        f"median {int(np.median(counts)) if counts else 0} per pair, {counts.count(0)} pairs without any"
     )
+
+
+def _order(pairs: Array, rows: Array) -> list[int]:
+    """The rows in an order in which ``HELD_IMAGES`` second images meet all their first ones."""
+    group = np.unique(pairs[rows, 1], return_inverse=True)[1] // HELD_IMAGES
+    ordered: list[int] = rows[np.lexsort((pairs[rows, 1], pairs[rows, 0], group))].tolist()
+    return ordered
 
 
 class FeatureFiles:
@@ -68,20 +79,21 @@ class FeatureFiles:
 
     def __init__(self, paths: Sequence[Path], stack: ExitStack) -> None:
         self.digests: dict[int, str] = {}
-        self._places: dict[int, tuple[Any, slice]] = {}
+        self._places: dict[int, tuple[list[Any], slice]] = {}
         for path in paths:
             file = stack.enter_context(LocalFeatures.open(path))
             offsets = file["offsets"][()].tolist()
             digests = file["digests"].asstr()[()]
+            # finding a column by its name takes longer than reading an image's part of it
+            columns = [file[column] for column in COLUMNS]
             for row, image in enumerate(file["image_ids"][()].tolist()):
                 self.digests[image] = str(digests[row])
-                self._places[image] = (file, slice(offsets[row], offsets[row + 1]))
+                self._places[image] = (columns, slice(offsets[row], offsets[row + 1]))
 
     def read(self, image: int) -> KeypointSet:
         """The features of one image of the index."""
-        file, part = self._places[image]
-        columns = ("keypoints", "descriptors", "scores", "scales", "angles")
-        return KeypointSet(*(file[column][part] for column in columns))
+        columns, part = self._places[image]
+        return KeypointSet(*(column[part] for column in columns))
 
 
 def _digest(first: str, second: str, options: "MatchPairsOptions") -> str:

@@ -1,5 +1,6 @@
 """Choose the pairs of images that are matched."""
 
+import itertools
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -27,14 +28,13 @@ def run(job: StageJob) -> None:
     options: SelectPairsOptions = job.options
     table = _choose(job, index, options, pairs_file)
     blocks = np.sort(index.blocks[table.pairs], axis=1)
-    for output in job.outputs:
-        tile = [int(part) for part in output.stem.split("-")]
+    for tile in itertools.combinations_with_replacement(range(int(job.settings["blocks"])), 2):
         part = table.take(np.flatnonzero((blocks == tile).all(axis=1)))
         ImagePairs(
             pairs=part.pairs,
             reasons=np.array(part.reason_texts(), dtype=object),
             similarities=part.similarities,
-        ).write(output, job.header)
+        ).write(job.output.with_name(f"{tile[0]}-{tile[1]}.h5"), job.header)
     print(f"{len(table.pairs)} pairs of {len(index.names)} images ({options.method})")
 
 

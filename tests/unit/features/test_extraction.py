@@ -67,7 +67,7 @@ def test_real_photographs_match_by_their_true_geometry(data):
         pixels = read_image(folder / "images" / name)
         points.append(extract_keypoints(detector, pixels.gray, pixels.rgb, 2000, 760))
     matcher = create_matcher("mutual_ratio")
-    matches, _ = matcher.match(matcher.prepare(points[0]), points[1])
+    matches, _ = matcher.match(matcher.prepare(points[0]), matcher.prepare_second(points[1]))
     rays = []
     for name, part, column in ((first, points[0], 0), (second, points[1], 1)):
         camera = model.cameras[images[name].camera_id]
