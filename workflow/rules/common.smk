@@ -21,7 +21,7 @@ RUN = Run(PLAN)
 IN_CONTAINER = (
     DeploymentMethod.APPTAINER in workflow.deployment_settings.deployment_method
 )
-# a rule with more outputs has a stage that can name them itself: Snakemake keeps the command with each output
+# a stage with more outputs names them itself, because Snakemake keeps the command with each of them
 MOST_LISTED_OUTPUTS = 16
 # freed images stay with the process, in huge pages: glibc would give them back, and each page is cleared anew
 MALLOC = "MALLOC_MMAP_THRESHOLD_=33554432 MALLOC_TRIM_THRESHOLD_=1073741824 GLIBC_TUNABLES=glibc.malloc.hugetlb=1"

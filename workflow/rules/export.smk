@@ -16,8 +16,9 @@ rule export_database:
         benchmark_file("export_database")
     params:
         job=job_params("export_database"),
-    script:
-        "../../scripts/export_database.py"
+        files=job_files(),
+    shell:
+        job_command("export_database")
 
 
 rule export_model:

@@ -1,0 +1,44 @@
+"""What a job reads from standard input."""
+
+import hashlib
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from snakesfm.job import Call
+
+NAMES = [
+    "a b.h5",
+    "quote'\".h5",
+    "$HOME `date` \\n.h5",
+    "{brace}.h5",
+    "ünïcödé 写真.h5",
+    "new\nline.h5",
+    "END OF JOB",
+]
+
+
+def text_of(log: str) -> str:
+    files = {"scene": "s", "inputs": {"one": NAMES[0], "all": NAMES}, "outputs": NAMES[1:2]}
+    return "\n".join([json.dumps({"seed": 3}), json.dumps(files), "2", log]) + "\n"
+
+
+@pytest.mark.parametrize("log", ["logs/job.log", "with space/ü.log", "new\nline/job.log"])
+def test_a_call_is_read_as_it_was_written(log: str) -> None:
+    call = Call.parse("match_pairs", text_of(log))
+    assert (call.stage, call.threads, call.log) == ("match_pairs", 2, Path(log))
+    assert call.params == {"seed": 3}
+    assert call.files == {"scene": "s", "inputs": {"one": NAMES[0], "all": NAMES}, "outputs": NAMES[1:2]}
+
+
+def test_a_here_document_of_many_files_arrives_unchanged() -> None:
+    files = json.dumps({"outputs": NAMES * 8_000})
+    code = "import sys, hashlib; print(hashlib.sha256(sys.stdin.buffer.read()).hexdigest())"
+    reader = f'exec "{sys.executable}" -c "{code}"'
+    script = f"{reader} <<'END OF JOB'\n{files}\nEND OF JOB\n"
+    out = subprocess.run(["bash"], input=script, capture_output=True, text=True, check=True).stdout
+    assert out.strip() == hashlib.sha256(f"{files}\n".encode()).hexdigest()
+    assert len(files) > 1_000_000
