@@ -178,7 +178,7 @@ class ScenePlan:
                 "pairs_content": _file_digest(inputs.pairs),
             }
         if stage == "adjust_bundle":
-            return {"intrinsics": inputs.intrinsics}
+            return {"images": str(self.images), "intrinsics": inputs.intrinsics}
         if stage == "export_model":
             return {"images": str(self.images)}
         if stage == "evaluate_model":

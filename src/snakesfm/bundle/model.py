@@ -130,6 +130,14 @@ def observations_of(reconstruction: pycolmap.Reconstruction) -> tuple[Array, Arr
     return positions, flat[:, 0], flat[:, 1], flat[:, 2]
 
 
+def observed_keypoints(reconstruction: pycolmap.Reconstruction, model: BundleModel) -> Array:
+    """Keypoints (L,2) float32 in pixels of the model's observations, as the reconstruction holds them."""
+    images = reconstruction.images
+    pairs = zip(model.image_ids.tolist(), model.keypoint_ids.tolist(), strict=True)
+    observed = [images[image + 1].point2D(row).xy for image, row in pairs]
+    return np.array(observed, dtype=np.float32).reshape(-1, 2)
+
+
 def reprojection_errors(model: BundleModel, keypoints: Array) -> Array:
     """Distance (L,) in pixels of each observation from its projected point; inf behind the camera.
 

@@ -9,6 +9,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from snakesfm.bundle.alignment import AlignmentSettings, GrayImage
 from snakesfm.bundle.completion import TrackCompleter
 from snakesfm.bundle.filtering import (
     deregister_weak_images,
@@ -17,6 +18,7 @@ from snakesfm.bundle.filtering import (
     reset_wild_cameras,
 )
 from snakesfm.bundle.interface import BundleAdjuster, SolverSettings
+from snakesfm.bundle.keypoint_refinement import refine_keypoints
 from snakesfm.bundle.registration import register_left_out
 from snakesfm.geometry.camera import Camera
 
@@ -50,6 +52,22 @@ class RoundSettings:
 
 
 @dataclass(frozen=True)
+class ImageSource:
+    """Where the pixels come from that keypoints are refined with.
+
+    Parameters
+    ----------
+    read_gray : gives the image of a row, or None where it cannot be read.
+    scales : (N,) how many original pixels a pixel of each gray image is wide, at most.
+    settings : how observations are aligned.
+    """
+
+    read_gray: Callable[[int], GrayImage | None]
+    scales: Array
+    settings: AlignmentSettings
+
+
+@dataclass(frozen=True)
 class RoundRecord:
     """What one round did: robust costs before and after, and the model's size and mean error after it."""
 
@@ -77,6 +95,7 @@ def adjust_rounds(
     solving: SolverSettings,
     settings: RoundSettings,
     report: Callable[[RoundRecord], None],
+    source: ImageSource | None = None,
 ) -> list[RoundRecord]:
     """Adjust, filter and complete a model in rounds that each start from the result of the one before.
 
@@ -88,14 +107,18 @@ def adjust_rounds(
     solving : how each pass is solved.
     settings : what is done in and between the rounds.
     report : called with each record as soon as it is there.
+    source : the images, where keypoints are to be refined before the last round.
     """
     mapper = _Mapper(reconstruction, graph, cameras, solving, settings, report)
     last = len(settings.thresholds_px) - 1
     if settings.rotations_first:
         mapper.round("rotations fixed", settings.thresholds_px[0] * 2, constant_rotations=True)
     for row, threshold in enumerate(settings.thresholds_px):
-        if row and settings.complete_tracks:
+        refined = source is not None and row > max(last - 1, 0)
+        if row and settings.complete_tracks and not refined:
             mapper.completer()
+        if source is not None and row == max(last - 1, 0):
+            refine_keypoints(reconstruction, source.read_gray, source.scales, source.settings)
         mapper.round(f"round {row + 1}", threshold, final=row == last)
     while settings.register_images and mapper.register():
         mapper.round("registration", settings.thresholds_px[-1], final=True)

@@ -51,6 +51,18 @@ class AdjustBundleOptions(StageOptions):
     complete_error_px: float = Field(default=4.0, gt=0.0)
     """Largest reprojection error of an observation that completion adds."""
 
+    refine_keypoints: bool = True
+    """Before the last round, move the observations of each point to where the images' pixels agree best."""
+
+    refine_shorter_side_px: int = Field(default=760, ge=64)
+    """Larger images are scaled down to this shorter side to refine keypoints; as for detection is best."""
+
+    refine_radius_px: int = Field(default=5, ge=2, le=30)
+    """Half the side of the patch around a keypoint that is compared, in pixels of the scaled image."""
+
+    refine_min_correlation: float = Field(default=0.8, ge=0.0, lt=1.0)
+    """Correlation from which on a refined keypoint is taken; others stay where they were found."""
+
     register_images: bool = True
     """Register images that averaging left out by their matches to points."""
 

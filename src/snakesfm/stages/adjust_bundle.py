@@ -1,5 +1,7 @@
 """Stage adjust_bundle: cameras, poses and points adjusted together."""
 
+from functools import lru_cache
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -8,11 +10,24 @@ from snakesfm.artifacts.gather import gather_image_columns, gather_inlier_matche
 from snakesfm.artifacts.images import CalibratedCameras, ImageIndex
 from snakesfm.artifacts.mapping import CameraCenters, CameraRotations, Reconstruction, TriangulatedPoints
 from snakesfm.artifacts.pairs import ViewGraph
+from snakesfm.bundle.alignment import AlignmentSettings, GrayImage
 from snakesfm.bundle.completion import correspondence_graph
 from snakesfm.bundle.interface import SolverSettings
-from snakesfm.bundle.model import BundleModel, from_reconstruction, reprojection_errors, to_reconstruction
-from snakesfm.bundle.rounds import RoundRecord, RoundSettings, adjust_rounds, mean_point_errors
-from snakesfm.errors import SceneError
+from snakesfm.bundle.model import (
+    BundleModel,
+    from_reconstruction,
+    observed_keypoints,
+    reprojection_errors,
+    to_reconstruction,
+)
+from snakesfm.bundle.rounds import (
+    ImageSource,
+    RoundRecord,
+    RoundSettings,
+    adjust_rounds,
+    mean_point_errors,
+)
+from snakesfm.errors import ImageError, SceneError
 from snakesfm.geometry.camera import cameras_from_columns, cameras_to_columns
 from snakesfm.geometry.poses import translation_of
 from snakesfm.stages.job import StageJob
@@ -20,6 +35,8 @@ from snakesfm.triangulation.tracks import mean_colors
 
 if TYPE_CHECKING:
     from snakesfm.config.adjust_bundle import AdjustBundleOptions
+
+KEPT_IMAGES = 256
 
 
 def run(job: StageJob) -> None:
@@ -65,14 +82,15 @@ def run(job: StageJob) -> None:
     posed = int(np.isfinite(model.rotations[:, 0, 0] + model.translations[:, 0]).sum())
     shared["min_track_length"] = min(options.min_track_length, max(2, posed))
     settings = RoundSettings(**shared, seed=job.seed_for("bundle"))
-    records = adjust_rounds(reconstruction, graph, cameras, solving, settings, _print_record)
+    source = _image_source(job, index) if options.refine_keypoints else None
+    records = adjust_rounds(reconstruction, graph, cameras, solving, settings, _print_record, source)
     result = from_reconstruction(reconstruction, model)
     if np.isfinite(result.rotations[:, 0, 0]).sum() < 2:
         raise SceneError(
             f"Scene '{job.scene}': bundle adjustment kept fewer than two images: the averaged poses do not "
             "fit the tracks; check the cameras' focal lengths, or lower adjust_bundle.min_observations."
         )
-    _write(job, result, keypoints, colors, records)
+    _write(job, result, observed_keypoints(reconstruction, result), keypoints, colors, records)
 
 
 def _usable_pairs(graph: ViewGraph, model: BundleModel) -> np.ndarray:
@@ -80,6 +98,36 @@ def _usable_pairs(graph: ViewGraph, model: BundleModel) -> np.ndarray:
     posed = np.isfinite(model.rotations[:, 0, 0]) & np.isfinite(model.translations[:, 0])
     usable: np.ndarray = graph.pairs[(graph.labels == 0) | ~posed[graph.pairs].all(axis=1)]
     return usable
+
+
+def _image_source(job: StageJob, index: ImageIndex) -> ImageSource:
+    """The images in gray, scaled down; the last ones are kept, as each is read twice."""
+    options: AdjustBundleOptions = job.options
+    side = options.refine_shorter_side_px
+    folder = Path(job.settings["images"])
+
+    @lru_cache(maxsize=KEPT_IMAGES)
+    def read_gray(row: int) -> GrayImage | None:
+        import cv2
+
+        from snakesfm.ingest.read import read_image
+
+        try:
+            image = read_image(folder / str(index.names[row]), side)
+        except ImageError as error:
+            print(f"warning: {error}")
+            return None
+        height, width = image.gray.shape
+        factor = min(1.0, side / min(height, width))
+        size = (max(1, round(width * factor)), max(1, round(height * factor)))
+        gray = image.gray if factor == 1.0 else cv2.resize(image.gray, size, interpolation=cv2.INTER_AREA)
+        return GrayImage(gray, image.reduction * np.array([width, height]) / np.array(size))
+
+    return ImageSource(
+        read_gray,
+        np.maximum(1.0, index.sizes.min(axis=1) / side),
+        AlignmentSettings(options.refine_radius_px, options.refine_min_correlation),
+    )
 
 
 def _print_record(record: RoundRecord) -> None:
@@ -94,13 +142,13 @@ def _print_record(record: RoundRecord) -> None:
 def _write(
     job: StageJob,
     model: BundleModel,
+    observed: np.ndarray,
     keypoints: list[np.ndarray],
     colors: list[np.ndarray],
     records: list[RoundRecord],
 ) -> None:
     base = np.r_[0, np.cumsum([len(k) for k in keypoints])]
     rows = base[model.image_ids] + model.keypoint_ids
-    observed = np.concatenate(keypoints)[rows]
     models, sizes, params, _ = cameras_to_columns(model.cameras)
     Reconstruction(
         camera_models=np.array(models),

@@ -1,0 +1,225 @@
+"""Keypoints of a point aligned to each other by the images' gray values.
+
+A detector places each keypoint on its own; the pixels around the keypoints of one point show one piece of
+surface, and agree on its place several times better (Lindenberger et al., Pixel-Perfect Structure-from-Motion,
+ICCV 2021). Here one observation of each point is the template, and the others are moved by the affine
+inverse-compositional algorithm (Baker and Matthews, IJCV 2004), which starts at the warp of a plane that
+faces the cameras.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[Any]
+
+MAX_MOVE_PX = 1.5
+"""An observation that moves farther has left its point; SIFT is off by a few tenths."""
+CONVERGED_PX = 0.01
+STALLED_PX = 0.1
+"""An observation whose last step is larger has not settled."""
+AFFINE_DAMPING = 1e-3
+"""Holds the affine part, relative to the weight of the shift, where a patch has little texture."""
+
+
+@dataclass(frozen=True)
+class GrayImage:
+    """Gray values (H,W) of an image, and how many of the original's pixels (2,) one of its own is wide and high."""
+
+    gray: Array
+    scale: Array
+
+
+@dataclass(frozen=True)
+class AlignmentSettings:
+    """How observations are aligned.
+
+    Parameters
+    ----------
+    radius_px : half the side of the square patch around a keypoint, in pixels of the gray images.
+    min_correlation : normalised correlation that an aligned patch must have with its template.
+    iterations : most steps per observation.
+    """
+
+    radius_px: int = 5
+    min_correlation: float = 0.8
+    iterations: int = 6
+
+
+def choose_templates(directions: Array, sizes: Array, inside: Array, offsets: Array) -> Array:
+    """The observation of each point whose view is the most central one.
+
+    Parameters
+    ----------
+    directions : (L,3) unit rays from the points' cameras, in the world.
+    sizes : (L,) log of how large the point's surroundings appear.
+    inside : (L,) bool, whether the patch lies in the image.
+    offsets : (T+1,) int64, rows ``offsets[k]:offsets[k+1]`` belong to point k.
+
+    Returns
+    -------
+    Rows (T,) int64.
+    """
+    counts = np.diff(offsets)
+    mean = np.add.reduceat(directions, offsets[:-1], axis=0)
+    mean /= np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-12)
+    point_of = np.repeat(np.arange(len(counts)), counts)
+    cosines = np.einsum("li,li->l", directions, mean[point_of])
+    level = np.add.reduceat(sizes, offsets[:-1]) / counts
+    oddness = np.arccos(np.clip(cosines, -1.0, 1.0)) + np.abs(sizes - level[point_of])
+    order = np.lexsort((oddness, ~inside, point_of))
+    return np.asarray(order[offsets[:-1]])
+
+
+def align_observations(
+    read_gray: Callable[[int], GrayImage | None],
+    images: Array,
+    pixels: Array,
+    tangents: Array,
+    templates: Array,
+    inside: Array,
+    settings: AlignmentSettings,
+) -> tuple[Array, Array]:
+    """Move observations to where their patch matches the template's best.
+
+    Parameters
+    ----------
+    read_gray : gives image k, or None where there are no pixels; called at most twice per image.
+    images : (L,) int, image of each observation.
+    pixels : (L,2) float64, original pixels.
+    tangents : (L,2,2), how an observation moves in pixels with two coordinates on the point's plane.
+    templates : (L,) int, row of the observation that is the template of each one; its own row for templates.
+    inside : (L,) bool, whether the patch lies in the image; others are left as they are.
+    settings : how.
+
+    Returns
+    -------
+    Pixels (L,2), and which observations (L,) bool were aligned or are templates; the others did not move.
+    """
+    moved, aligned = pixels.copy(), np.zeros(len(images), dtype=bool)
+    others = templates != np.arange(len(images))
+    usable = others & inside & inside[templates]
+    sources = np.unique(templates[usable])
+    side = 2 * settings.radius_px + 3
+    patches = np.zeros((len(sources), side, side), dtype=np.float32)
+    scales = np.ones((int(images.max(initial=-1)) + 1, 2))
+    x, y = _grid(settings.radius_px + 1)
+    for image, rows in _by_image(images[sources], np.arange(len(sources))):
+        read = read_gray(image)
+        if read is not None:
+            place = pixels[sources[rows]] / read.scale
+            gray = read.gray.astype(np.float32)
+            patches[rows] = _sample(gray, place[:, :1] + x, place[:, 1:] + y).reshape(-1, side, side)
+            scales[image] = read.scale
+            aligned[sources[rows]] = True
+    usable &= aligned[templates]
+    position = np.searchsorted(sources, templates)
+    for image, rows in _by_image(images[usable], np.nonzero(usable)[0]):
+        read = read_gray(image)
+        if read is None:
+            continue
+        own = templates[rows]
+        to_plane = np.linalg.pinv(tangents[own] / scales[images[own], :, None])
+        place, aligned[rows] = _align_in_image(
+            read.gray.astype(np.float32),
+            pixels[rows] / read.scale,
+            tangents[rows] / read.scale[:, None] @ to_plane,
+            patches[position[rows]],
+            settings,
+        )
+        moved[rows] = np.where(aligned[rows, None], place * read.scale, pixels[rows])
+    return moved, aligned
+
+
+def _by_image(images: Array, rows: Array) -> list[tuple[int, Array]]:
+    """The rows of each image, of ``rows`` whose images are ``images``."""
+    order = np.argsort(images, kind="stable")
+    found, starts = np.unique(images[order], return_index=True)
+    return list(zip(found.tolist(), np.split(rows[order], starts[1:]), strict=True)) if len(order) else []
+
+
+def _grid(radius: int) -> tuple[Array, Array]:
+    """x and y (n,) float32 of the pixels of a square patch around its centre."""
+    steps = np.arange(-radius, radius + 1, dtype=np.float32)
+    x, y = np.meshgrid(steps, steps)
+    return x.ravel(), y.ravel()
+
+
+def _sample(gray: Array, x: Array, y: Array) -> Array:
+    """Gray values (M,S) float32 at pixels, whose first one has its centre at (0.5, 0.5)."""
+    half = np.float32(0.5)
+    columns, rows = x.astype(np.float32) - half, y.astype(np.float32) - half
+    sampled = np.empty(columns.shape, dtype=np.float32)
+    # OpenCV's maps are shorter than 2^15
+    for start in range(0, len(columns), 1 << 14):
+        part = slice(start, start + (1 << 14))
+        sampled[part] = cv2.remap(
+            gray, columns[part], rows[part], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE
+        )
+    return sampled
+
+
+def _align_in_image(
+    gray: Array, pixels: Array, warps: Array, templates: Array, settings: AlignmentSettings
+) -> tuple[Array, Array]:
+    """Aligned pixels (M,2) of observations in one image, and which (M,) bool are to be trusted."""
+    radius = settings.radius_px
+    x, y = _grid(radius)
+    window = np.exp(-(x**2 + y**2) / (2 * (0.6 * radius) ** 2))
+    window /= window.sum()
+    wanted, slopes, inverse = _prepare(templates, x, y, window)
+    place, warps = pixels.copy(), warps.copy()
+    last = np.full(len(pixels), np.inf)
+    active = np.arange(len(pixels))
+    for _ in range(settings.iterations):
+        found, gain = _match(gray, place[active], warps[active], x, y, window, wanted[active])
+        difference = found * gain[:, None] - wanted[active]
+        slope = np.matmul(slopes[active], difference[:, :, None])
+        step = np.matmul(inverse[active], slope)[:, :, 0]
+        turn = np.linalg.inv(np.eye(2) + step[:, 2:].reshape(-1, 2, 2))
+        warps[active] = warps[active] @ turn
+        shift = -np.einsum("mij,mj->mi", warps[active], step[:, :2])
+        length = np.linalg.norm(shift, axis=1)
+        place[active] += shift / np.maximum(length, 1.0)[:, None]
+        last[active] = length
+        active = active[np.isfinite(length) & (length > CONVERGED_PX)]
+    finite = np.isfinite(place).all(axis=1) & np.isfinite(warps).all(axis=(1, 2))
+    good = finite & (last < STALLED_PX) & (np.linalg.norm(place - pixels, axis=1) < MAX_MOVE_PX)
+    rows = np.nonzero(good)[0]
+    found, gain = _match(gray, place[rows], warps[rows], x, y, window, wanted[rows])
+    # the gain is the regression of the template on the patch, so their correlation is its share explained
+    explained = gain**2 * ((found**2) @ window) / np.maximum((wanted[rows] ** 2) @ window, 1e-12)
+    good[rows] = (gain > 0) & (explained > settings.min_correlation**2)
+    return place, good
+
+
+def _prepare(templates: Array, x: Array, y: Array, window: Array) -> tuple[Array, Array, Array]:
+    """Templates (M,n) of mean zero, their weighted slopes (M,6,n), and the inverse normal matrices (M,6,6)."""
+    count = len(templates)
+    inner = templates[:, 1:-1, 1:-1].reshape(count, -1)
+    wanted = inner - (inner @ window)[:, None]
+    across = (templates[:, 1:-1, 2:] - templates[:, 1:-1, :-2]).reshape(count, -1) / 2
+    down = (templates[:, 2:, 1:-1] - templates[:, :-2, 1:-1]).reshape(count, -1) / 2
+    slopes = np.stack([across, down, across * x, across * y, down * x, down * y], axis=1)
+    weighted = slopes * window
+    normal = np.matmul(weighted, slopes.transpose(0, 2, 1)).astype(np.float64)
+    strength = normal[:, 0, 0] + normal[:, 1, 1]
+    damping = np.array([0, 0, 1, 1, 1, 1]) * AFFINE_DAMPING * x.max() ** 2 + 1e-6
+    normal[:, range(6), range(6)] += damping * np.maximum(strength, 1e-6)[:, None]
+    return wanted, weighted, np.linalg.inv(normal)
+
+
+def _match(
+    gray: Array, place: Array, warps: Array, x: Array, y: Array, window: Array, wanted: Array
+) -> tuple[Array, Array]:
+    """Patches (M,n) of mean zero under the warps, and the gains (M,) that bring them to the templates."""
+    columns = place[:, :1] + warps[:, 0, :1] * x + warps[:, 0, 1:] * y
+    rows = place[:, 1:] + warps[:, 1, :1] * x + warps[:, 1, 1:] * y
+    found = _sample(gray, columns, rows)
+    found -= (found @ window)[:, None]
+    energy = (found**2) @ window
+    return found, ((found * wanted) @ window) / np.maximum(energy, 1e-6)

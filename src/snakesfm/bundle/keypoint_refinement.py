@@ -1,0 +1,126 @@
+"""The keypoints of a reconstruction's observations aligned to each other in the images."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from snakesfm.bundle.alignment import (
+    AlignmentSettings,
+    GrayImage,
+    align_observations,
+    choose_templates,
+)
+from snakesfm.bundle.model import observations_of
+
+Array = NDArray[Any]
+
+MIN_ALIGNED_SHARE = 0.5
+"""Where fewer of an image's observations look like their points, the image is another season or time of day."""
+STEP_PX = 1.0
+"""How far apart the points are whose projections give the warps."""
+
+
+def refine_keypoints(
+    reconstruction: pycolmap.Reconstruction,
+    read_gray: Callable[[int], GrayImage | None],
+    gray_scales: Array,
+    settings: AlignmentSettings,
+) -> tuple[int, int]:
+    """Align the observations of every point to the most central one, and move the image's keypoints there.
+
+    Parameters
+    ----------
+    reconstruction : changed in place: keypoints only.
+    read_gray : gives image k (row, not id), or None where there are no pixels.
+    gray_scales : (N,) how many original pixels a pixel of each gray image is wide, at most.
+    settings : how.
+
+    Returns
+    -------
+    How many observations were aligned or are templates, and how many there are.
+    """
+    points, point_of, images, rows = observations_of(reconstruction)
+    if not len(images):
+        return 0, 0
+    offsets = np.searchsorted(point_of, np.arange(len(points) + 1))
+    found = reconstruction.images
+    pixels = np.array(
+        [found[i + 1].point2D(k).xy for i, k in zip(images.tolist(), rows.tolist(), strict=True)]
+    )
+    directions, sizes, tangents = _views(reconstruction, points, point_of, images, offsets)
+    inside = _patch_inside(reconstruction, images, pixels, gray_scales, settings.radius_px)
+    chosen = choose_templates(directions, sizes, inside, offsets)
+    moved, aligned = align_observations(
+        read_gray, images, pixels, tangents, chosen[point_of], inside, settings
+    )
+    drop = _droppable(images, aligned)
+    for row in np.nonzero((moved != pixels).any(axis=1))[0].tolist():
+        found[int(images[row]) + 1].point2D(int(rows[row])).xy = moved[row]
+    for image, row in zip(images[drop].tolist(), rows[drop].tolist(), strict=True):
+        if found[image + 1].point2D(row).has_point3D():
+            reconstruction.delete_observation(image + 1, row)
+    return int(aligned.sum()), len(aligned)
+
+
+def _droppable(images: Array, aligned: Array) -> Array:
+    """Observations (L,) bool that do not look like their point, in images where most do."""
+    counts = np.maximum(np.bincount(images), 1)
+    shares = np.bincount(images, weights=aligned, minlength=len(counts)) / counts
+    return ~aligned & (shares[images] >= MIN_ALIGNED_SHARE)
+
+
+def _views(
+    reconstruction: pycolmap.Reconstruction, points: Array, point_of: Array, images: Array, offsets: Array
+) -> tuple[Array, Array, Array]:
+    """Rays (L,3), log sizes (L,) and tangents (L,2,2) of observations of points on planes facing the cameras."""
+    count = int(images.max()) + 1
+    rotations, translations, focals = np.zeros((count, 3, 3)), np.zeros((count, 3)), np.ones(count)
+    for image in np.unique(images).tolist():
+        seen = reconstruction.image(image + 1)
+        pose = seen.cam_from_world()
+        rotations[image], translations[image] = pose.rotation.matrix(), pose.translation
+        focals[image] = reconstruction.camera(seen.camera_id).mean_focal_length()
+    in_camera = np.einsum("lij,lj->li", rotations[images], points[point_of]) + translations[images]
+    depths = np.linalg.norm(in_camera, axis=1)
+    directions = np.einsum("lji,lj->li", rotations[images], in_camera) / depths[:, None]
+    sizes = np.log(focals[images] / depths)
+
+    normals = np.add.reduceat(directions, offsets[:-1], axis=0)
+    first = np.cross(normals, np.eye(3)[np.argmin(np.abs(normals), axis=1)])
+    first /= np.maximum(np.linalg.norm(first, axis=1, keepdims=True), 1e-12)
+    second = np.cross(normals, first)
+    second /= np.maximum(np.linalg.norm(second, axis=1, keepdims=True), 1e-12)
+    widths = STEP_PX / np.exp(np.add.reduceat(sizes, offsets[:-1]) / np.diff(offsets))
+    tangents = np.empty((len(images), 2, 2))
+    center = _project(reconstruction, images, in_camera)
+    for column, axis in enumerate((first, second)):
+        offset = np.einsum("lij,lj->li", rotations[images], (axis * widths[:, None])[point_of])
+        tangents[:, :, column] = _project(reconstruction, images, in_camera + offset) - center
+    return directions, sizes, tangents
+
+
+def _project(reconstruction: pycolmap.Reconstruction, images: Array, in_camera: Array) -> Array:
+    """Pixels (L,2) of points (L,3) in the frames of their images' cameras."""
+    cameras = np.zeros(int(images.max()) + 1, dtype=np.int64)
+    for image in np.unique(images).tolist():
+        cameras[image] = reconstruction.image(image + 1).camera_id
+    pixels = np.full((len(images), 2), np.nan)
+    for camera in np.unique(cameras[images]).tolist():
+        rows = np.nonzero(cameras[images] == camera)[0]
+        pixels[rows] = reconstruction.camera(camera).img_from_cam(in_camera[rows])
+    return pixels
+
+
+def _patch_inside(
+    reconstruction: pycolmap.Reconstruction, images: Array, pixels: Array, gray_scales: Array, radius: int
+) -> Array:
+    """Observations (L,) bool whose patch, with the border for gradients and interpolation, is in the image."""
+    sizes = np.zeros((int(images.max()) + 1, 2))
+    for image in np.unique(images).tolist():
+        camera = reconstruction.camera(reconstruction.image(image + 1).camera_id)
+        sizes[image] = camera.width, camera.height
+    margins = ((radius + 3) * gray_scales[images])[:, None]
+    return np.asarray(((pixels >= margins) & (pixels <= sizes[images] - margins)).all(axis=1))
