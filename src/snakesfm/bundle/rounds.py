@@ -60,11 +60,13 @@ class ImageSource:
     read_gray : gives the image of a row, or None where it cannot be read.
     scales : (N,) how many original pixels a pixel of each gray image is wide, at most.
     settings : how observations are aligned.
+    report : called with how many observations were aligned or are templates, and how many there are.
     """
 
     read_gray: Callable[[int], GrayImage | None]
     scales: Array
     settings: AlignmentSettings
+    report: Callable[[int, int], None]
 
 
 @dataclass(frozen=True)
@@ -107,18 +109,21 @@ def adjust_rounds(
     solving : how each pass is solved.
     settings : what is done in and between the rounds.
     report : called with each record as soon as it is there.
-    source : the images, where keypoints are to be refined before the last round.
+    source : the images, where keypoints are to be refined before the last round but one.
     """
     mapper = _Mapper(reconstruction, graph, cameras, solving, settings, report)
     last = len(settings.thresholds_px) - 1
     if settings.rotations_first:
         mapper.round("rotations fixed", settings.thresholds_px[0] * 2, constant_rotations=True)
     for row, threshold in enumerate(settings.thresholds_px):
-        refined = source is not None and row > max(last - 1, 0)
-        if row and settings.complete_tracks and not refined:
+        refine_now = source is not None and row == max(last - 1, 0)
+        # what completion adds is not refined, so it ends where refinement begins
+        if row and settings.complete_tracks and (source is None or row < last or refine_now):
             mapper.completer()
-        if source is not None and row == max(last - 1, 0):
-            refine_keypoints(reconstruction, source.read_gray, source.scales, source.settings)
+        if source is not None and refine_now:
+            source.report(
+                *refine_keypoints(reconstruction, source.read_gray, source.scales, source.settings)
+            )
         mapper.round(f"round {row + 1}", threshold, final=row == last)
     while settings.register_images and mapper.register():
         mapper.round("registration", settings.thresholds_px[-1], final=True)

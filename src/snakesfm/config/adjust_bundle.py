@@ -10,7 +10,7 @@ from snakesfm.config.base import StageOptions
 class AdjustBundleOptions(StageOptions):
     """How cameras, poses and points are adjusted together."""
 
-    stage_version: ClassVar[int] = 2
+    stage_version: ClassVar[int] = 3
 
     solver: Literal["ceres", "gtsam"] = "ceres"
     """Least-squares solver: Ceres through pycolmap, or gtsam (slower, fewer camera models)."""
@@ -52,7 +52,7 @@ class AdjustBundleOptions(StageOptions):
     """Largest reprojection error of an observation that completion adds."""
 
     refine_keypoints: bool = True
-    """Before the last round, move the observations of each point to where the images' pixels agree best."""
+    """Before the last two rounds, move each point's observations to where the images' pixels agree best."""
 
     refine_shorter_side_px: int = Field(default=760, ge=64)
     """Larger images are scaled down to this shorter side to refine keypoints; as for detection is best."""

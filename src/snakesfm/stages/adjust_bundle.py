@@ -102,16 +102,17 @@ def _usable_pairs(graph: ViewGraph, model: BundleModel) -> np.ndarray:
 
 def _image_source(job: StageJob, index: ImageIndex) -> ImageSource:
     """The images in gray, scaled down; the last ones are kept, as each is read twice."""
+    import cv2
+
+    from snakesfm.ingest.read import read_image
+
     options: AdjustBundleOptions = job.options
     side = options.refine_shorter_side_px
     folder = Path(job.settings["images"])
+    cv2.setNumThreads(job.threads)
 
     @lru_cache(maxsize=KEPT_IMAGES)
     def read_gray(row: int) -> GrayImage | None:
-        import cv2
-
-        from snakesfm.ingest.read import read_image
-
         try:
             image = read_image(folder / str(index.names[row]), side)
         except ImageError as error:
@@ -127,6 +128,7 @@ def _image_source(job: StageJob, index: ImageIndex) -> ImageSource:
         read_gray,
         np.maximum(1.0, index.sizes.min(axis=1) / side),
         AlignmentSettings(options.refine_radius_px, options.refine_min_correlation),
+        lambda aligned, count: print(f"keypoints refined: {aligned} of {count} observations", flush=True),
     )
 
 

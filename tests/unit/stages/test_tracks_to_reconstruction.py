@@ -145,7 +145,8 @@ def run(stage, options, inputs, output, **settings):
 def run_all(inputs, tmp_path, name="model.h5", **options):
     run(build_tracks, BuildTracksOptions(), inputs, inputs["tracks"])
     run(triangulate_tracks, TriangulateTracksOptions(), inputs, inputs["points"])
-    run(adjust_bundle, AdjustBundleOptions(**options), inputs, tmp_path / name, intrinsics="fixed")
+    settings = {"intrinsics": "fixed", "images": str(tmp_path / "images")}
+    run(adjust_bundle, AdjustBundleOptions(**options), inputs, tmp_path / name, **settings)
     return Reconstruction.read(tmp_path / name)
 
 
@@ -170,7 +171,14 @@ def test_stages_in_a_row(made, inputs, tmp_path, capsys):
     assert model.round_names.tolist() == ["round 1", "round 2", "round 3", "registration"]
     assert model.round_counts[-1].tolist() == [COUNT, len(model.points), len(model.image_ids)]
     assert model.round_errors_px[-1] == pytest.approx(model.errors_px.mean(), abs=0.02)
-    assert "round 3: cost" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "round 3: cost" in printed
+    # the scene has no photographs: keypoints stay as they are, and that is said
+    assert "images/3.jpg does not exist" in printed and "keypoints refined: 0 of" in printed
+    base = np.r_[0, np.cumsum([len(points) for points in made.keypoints])]
+    np.testing.assert_array_equal(
+        model.keypoints, np.concatenate(made.keypoints)[base[model.image_ids] + model.keypoint_ids]
+    )
 
 
 def test_same_bytes_again(inputs, tmp_path):

@@ -1,0 +1,161 @@
+"""Observations aligned in rendered images of a textured plane, whose keypoints are known exactly."""
+
+import cv2
+import numpy as np
+import pytest
+
+from snakesfm.bundle.alignment import (
+    AlignmentSettings,
+    GrayImage,
+    align_observations,
+    choose_templates,
+)
+from snakesfm.bundle.keypoint_refinement import refine_keypoints
+from snakesfm.bundle.model import BundleModel, observations_of, to_reconstruction
+from snakesfm.geometry.camera import Camera
+from snakesfm.geometry.rotations import exp_so3
+
+SETTINGS = AlignmentSettings()
+TEXTURE_PX_PER_UNIT = 100.0
+CAMERA = Camera("SIMPLE_RADIAL", 400, 300, (400.0, 200.0, 150.0, 0.0))
+
+
+def texture(seed: int, height: int = 900, width: int = 1200) -> np.ndarray:
+    """Random gray values with structures of some pixels."""
+    rng = np.random.default_rng(seed)
+    noise = cv2.GaussianBlur(rng.normal(size=(height, width)).astype(np.float32), (0, 0), 2.5)
+    return np.clip(128 + 400 * noise, 0, 255).astype(np.uint8)
+
+
+def camera_matrix() -> np.ndarray:
+    focal, x, y, _ = CAMERA.params
+    return np.array([[focal, 0, x], [0, focal, y], [0, 0, 1]])
+
+
+def plane_to_image(rotation: np.ndarray, translation: np.ndarray) -> np.ndarray:
+    """Homography from the plane z = 0 of the world to pixels."""
+    return camera_matrix() @ np.column_stack([rotation[:, 0], rotation[:, 1], translation])
+
+
+def render(look: np.ndarray, homography: np.ndarray) -> np.ndarray:
+    """The texture, whose first pixel is at the plane's (-6, -4.5), in an image; centres are at one half."""
+    to_plane = np.array([[1, 0, -600.0], [0, 1, -450.0], [0, 0, TEXTURE_PX_PER_UNIT]]) / TEXTURE_PX_PER_UNIT
+    half = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1]])
+    warp = np.linalg.inv(half) @ homography @ to_plane @ half
+    return cv2.warpPerspective(look, warp, (400, 300), flags=cv2.INTER_AREA)
+
+
+@pytest.fixture(scope="module")
+def scene():
+    """Five views of the plane, of different brightness, and where 150 of its points are in them."""
+    rng = np.random.default_rng(1)
+    points = np.column_stack([rng.uniform(-1.2, 1.2, (150, 2)), np.zeros(150)])
+    look, images, poses, pixels = texture(0), [], [], []
+    for k in range(5):
+        rotation = exp_so3(np.array([0.08 * (k - 2), 0.12 * (k - 2), 0.2 * k]))
+        translation = np.array([0.1 * k - 0.2, 0.05 * k, 4.0 + 0.2 * k])
+        images.append(np.clip(render(look, plane_to_image(rotation, translation)) * (0.6 + 0.1 * k), 0, 255))
+        poses.append((rotation, translation))
+        seen = points @ rotation.T + translation
+        pixels.append(400.0 * seen[:, :2] / seen[:, 2:] + np.array([200.0, 150.0]))
+    return points, [image.astype(np.uint8) for image in images], poses, np.array(pixels)
+
+
+def model_of(scene, noise_px: float):
+    """The true model with noisy keypoints, as a reconstruction."""
+    points, _, poses, pixels = scene
+    rng = np.random.default_rng(2)
+    keypoints = [p + rng.normal(0, noise_px, p.shape) for p in pixels]
+    count = len(points)
+    model = BundleModel(
+        (CAMERA,),
+        np.zeros(5, np.int32),
+        np.array([rotation for rotation, _ in poses]),
+        np.array([translation for _, translation in poses]),
+        points,
+        np.arange(count + 1) * 5,
+        np.tile(np.arange(5, dtype=np.int32), count),
+        np.repeat(np.arange(count, dtype=np.int32), 5),
+    )
+    return to_reconstruction(model, keypoints, [f"{k}.jpg" for k in range(5)])
+
+
+def spread_px(reconstruction, pixels: np.ndarray) -> np.ndarray:
+    """How far (L,) the keypoints of a point are from their true places, up to what all of them share."""
+    points, point_of, images, rows = observations_of(reconstruction)
+    found = np.array(
+        [reconstruction.image(i + 1).point2D(k).xy for i, k in zip(images.tolist(), rows.tolist())]
+    )
+    offsets = found - pixels[images, rows]
+    sums = np.zeros((len(points), 2))
+    np.add.at(sums, point_of, offsets)
+    return np.linalg.norm(offsets - (sums / np.bincount(point_of)[:, None])[point_of], axis=1)
+
+
+def read(images, scale: float = 1.0):
+    def read_gray(row):
+        if images[row] is None:
+            return None
+        size = (round(400 / scale), round(300 / scale))
+        gray = cv2.resize(images[row], size, interpolation=cv2.INTER_AREA) if scale > 1 else images[row]
+        return GrayImage(gray, np.array([scale, scale]))
+
+    return read_gray
+
+
+@pytest.mark.parametrize(("scale", "least", "most"), [(1.0, 0.001, 0.12), (2.0, 0.001, 0.25)])
+def test_keypoints_of_a_point_come_to_agree(scene, scale, least, most):
+    reconstruction = model_of(scene, 0.35)
+    before = np.median(spread_px(reconstruction, scene[3]))
+    assert 0.3 < before < 0.5
+    scales = np.full(5, scale)
+    aligned, count = refine_keypoints(reconstruction, read(scene[1], scale), scales, SETTINGS)
+    assert 0.9 * count < aligned <= count == 750
+    after = np.median(spread_px(reconstruction, scene[3]))
+    assert least < after < most
+
+
+def test_an_observation_of_something_else_is_dropped_and_an_image_of_another_look_is_not(scene):
+    images = [image.copy() for image in scene[1]]
+    other = texture(9)[:300, :400]
+    images[1][:, :120] = other[:, :120]
+    images[4] = other
+    reconstruction = model_of(scene, 0.2)
+    refine_keypoints(reconstruction, read(images), np.ones(5), SETTINGS)
+    _, _, owners, rows = observations_of(reconstruction)
+    hidden = scene[3][1][:, 0] < 110
+    kept = np.isin(np.arange(150), rows[owners == 1])
+    assert hidden.sum() > 10
+    assert kept[hidden].mean() < 0.1
+    assert kept[scene[3][1][:, 0] > 130].mean() > 0.9
+    # nothing in the fifth image looks like the others: it keeps its keypoints where they were
+    assert (owners == 4).sum() == 150
+
+
+def test_images_that_cannot_be_read_keep_their_keypoints(scene):
+    reconstruction = model_of(scene, 0.2)
+    before = [reconstruction.image(3).point2D(k).xy.copy() for k in range(150)]
+    refine_keypoints(reconstruction, read([*scene[1][:2], None, *scene[1][3:]]), np.ones(5), SETTINGS)
+    np.testing.assert_array_equal(before, [reconstruction.image(3).point2D(k).xy for k in range(150)])
+    assert reconstruction.image(3).num_points3D == 150
+
+
+def test_patches_outside_do_not_move(scene):
+    images = np.array([0, 1])
+    pixels = np.array([[3.0, 3.0], [200.0, 150.0]])
+    tangents = np.tile(np.eye(2), (2, 1, 1))
+    moved, aligned = align_observations(
+        read(scene[1]), images, pixels, tangents, np.array([1, 1]), np.array([False, True]), SETTINGS
+    )
+    np.testing.assert_array_equal(moved, pixels)
+    assert not aligned.any()
+
+
+def test_the_template_is_the_central_view_with_its_patch_inside():
+    angles = np.array([-0.4, 0.05, 0.5])
+    directions = np.column_stack([np.sin(angles), np.zeros(3), np.cos(angles)])
+    offsets = np.array([0, 3])
+    inside = np.ones(3, bool)
+    assert choose_templates(directions, np.zeros(3), inside, offsets).tolist() == [1]
+    assert choose_templates(directions, np.array([0.0, 2.0, 0.0]), inside, offsets).tolist() != [1]
+    assert choose_templates(directions, np.zeros(3), np.array([True, False, True]), offsets).tolist() == [0]
