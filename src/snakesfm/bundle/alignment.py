@@ -1,10 +1,10 @@
 """Keypoints of a point aligned to each other by the images' gray values.
 
 A detector places each keypoint on its own; the pixels around the keypoints of one point show one piece of
-surface, and agree on its place several times better (Lindenberger et al., Pixel-Perfect Structure-from-Motion,
-ICCV 2021). Here one observation of each point is the template, and the others are moved by the affine
-inverse-compositional algorithm (Baker and Matthews, IJCV 2004), which starts at the warp of a plane that
-faces the cameras.
+surface, and agree on its place several times better (Lindenberger et al., Pixel-Perfect
+Structure-from-Motion, ICCV 2021). Here one observation of each point is the template, and the others are
+moved by the affine inverse-compositional algorithm (Baker and Matthews, IJCV 2004), which starts at the
+warp of a plane that faces the cameras.
 """
 
 from collections.abc import Callable
@@ -28,7 +28,7 @@ AFFINE_DAMPING = 1e-3
 
 @dataclass(frozen=True)
 class GrayImage:
-    """Gray values (H,W) of an image, and how many of the original's pixels (2,) one of its own is wide and high."""
+    """Gray values (H,W) of an image, and the width and height (2,) of its pixels in original pixels."""
 
     gray: Array
     scale: Array
@@ -92,7 +92,7 @@ def align_observations(
     images : (L,) int, image of each observation.
     pixels : (L,2) float64, original pixels.
     tangents : (L,2,2), how an observation moves in pixels with two coordinates on the point's plane.
-    templates : (L,) int, row of the observation that is the template of each one; its own row for templates.
+    templates : (L,) int, row of the observation that is the template of each; of templates, their own.
     inside : (L,) bool, whether the patch lies in the image; others are left as they are.
     settings : how.
 
@@ -143,7 +143,7 @@ def _by_image(images: Array, rows: Array) -> list[tuple[int, Array]]:
 
 
 def _grid(radius: int) -> tuple[Array, Array]:
-    """x and y (n,) float32 of the pixels of a square patch around its centre."""
+    """Columns and rows (n,) float32 of the pixels of a square patch around its centre."""
     steps = np.arange(-radius, radius + 1, dtype=np.float32)
     x, y = np.meshgrid(steps, steps)
     return x.ravel(), y.ravel()
@@ -198,7 +198,7 @@ def _align_in_image(
 
 
 def _prepare(templates: Array, x: Array, y: Array, window: Array) -> tuple[Array, Array, Array]:
-    """Templates (M,n) of mean zero, their weighted slopes (M,6,n), and the inverse normal matrices (M,6,6)."""
+    """Templates (M,n) of mean zero, weighted slopes (M,6,n), and inverse normal matrices (M,6,6)."""
     count = len(templates)
     inner = templates[:, 1:-1, 1:-1].reshape(count, -1)
     wanted = inner - (inner @ window)[:, None]

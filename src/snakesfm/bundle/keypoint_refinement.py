@@ -17,8 +17,8 @@ from snakesfm.bundle.model import observations_of
 
 Array = NDArray[Any]
 
-MIN_ALIGNED_SHARE = 0.5
-"""Where fewer of an image's observations look like their points, the image is another season or time of day."""
+MIN_ALIGNED_SHARE = 0.75
+"""Where fewer of an image's observations can be aligned, the image is blurred or of another light."""
 STEP_PX = 1.0
 """How far apart the points are whose projections give the warps."""
 
@@ -31,9 +31,11 @@ def refine_keypoints(
 ) -> tuple[int, int]:
     """Align the observations of every point to the most central one, and move the image's keypoints there.
 
+    An observation that cannot be aligned, in an image where most can, does not show its point and goes.
+
     Parameters
     ----------
-    reconstruction : changed in place: keypoints only.
+    reconstruction : changed in place: keypoints and observations.
     read_gray : gives image k (row, not id), or None where there are no pixels.
     gray_scales : (N,) how many original pixels a pixel of each gray image is wide, at most.
     settings : how.
@@ -66,7 +68,7 @@ def refine_keypoints(
 
 
 def _droppable(images: Array, aligned: Array) -> Array:
-    """Observations (L,) bool that do not look like their point, in images where most do."""
+    """Observations (L,) bool that do not look like their point, in images where most can be aligned."""
     counts = np.maximum(np.bincount(images), 1)
     shares = np.bincount(images, weights=aligned, minlength=len(counts)) / counts
     return ~aligned & (shares[images] >= MIN_ALIGNED_SHARE)
@@ -75,7 +77,7 @@ def _droppable(images: Array, aligned: Array) -> Array:
 def _views(
     reconstruction: pycolmap.Reconstruction, points: Array, point_of: Array, images: Array, offsets: Array
 ) -> tuple[Array, Array, Array]:
-    """Rays (L,3), log sizes (L,) and tangents (L,2,2) of observations of points on planes facing the cameras."""
+    """Rays (L,3), log sizes (L,) and tangents (L,2,2) of observations; planes face the cameras."""
     count = int(images.max()) + 1
     rotations, translations, focals = np.zeros((count, 3, 3)), np.zeros((count, 3)), np.ones(count)
     for image in np.unique(images).tolist():
@@ -117,7 +119,7 @@ def _project(reconstruction: pycolmap.Reconstruction, images: Array, in_camera: 
 def _patch_inside(
     reconstruction: pycolmap.Reconstruction, images: Array, pixels: Array, gray_scales: Array, radius: int
 ) -> Array:
-    """Observations (L,) bool whose patch, with the border for gradients and interpolation, is in the image."""
+    """Observations (L,) bool whose patch is in the image, with a border for gradients and interpolation."""
     sizes = np.zeros((int(images.max()) + 1, 2))
     for image in np.unique(images).tolist():
         camera = reconstruction.camera(reconstruction.image(image + 1).camera_id)

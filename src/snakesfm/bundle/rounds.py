@@ -35,7 +35,7 @@ class RoundSettings:
     thresholds_px: tuple[float, ...] = (10.0, 5.0, 3.0)
     rotations_first: bool = False
     loss_scale_px: float | Literal["auto"] = "auto"
-    loss_scale_sigmas: float = 2.4
+    loss_scale_sigmas: float = 3.5
     early_loss_share: float = 0.4
     max_focal_change: float = 3.0
     max_distortion: float = 1.0

@@ -24,8 +24,8 @@ class AdjustBundleOptions(StageOptions):
     loss_scale_px: Literal["auto"] | Annotated[float, Field(gt=0.0, le=100.0)] = "auto"
     """Reprojection error from which on the loss of the last round grows more slowly; 'auto' measures it."""
 
-    loss_scale_sigmas: float = Field(default=2.4, gt=0.0, le=100.0)
-    """What 'auto' takes: so many standard deviations of the keypoints' noise; 2.4 keeps 95 % efficiency."""
+    loss_scale_sigmas: float = Field(default=3.5, gt=0.0, le=100.0)
+    """What 'auto' takes: so many standard deviations of the keypoints' noise; 2.4 without refinement."""
 
     early_loss_share: float = Field(default=0.4, ge=0.0, le=10.0)
     """The same of earlier rounds, as a share of the round's threshold: a bad start needs a wide loss."""

@@ -54,7 +54,9 @@ def scene():
     for k in range(5):
         rotation = exp_so3(np.array([0.08 * (k - 2), 0.12 * (k - 2), 0.2 * k]))
         translation = np.array([0.1 * k - 0.2, 0.05 * k, 4.0 + 0.2 * k])
-        images.append(np.clip(render(look, plane_to_image(rotation, translation)) * (0.6 + 0.1 * k), 0, 255))
+        images.append(
+            np.clip(render(look, plane_to_image(rotation, translation)) * (0.6 + 0.1 * k), 0, 255)
+        )
         poses.append((rotation, translation))
         seen = points @ rotation.T + translation
         pixels.append(400.0 * seen[:, :2] / seen[:, 2:] + np.array([200.0, 150.0]))
@@ -84,7 +86,10 @@ def spread_px(reconstruction, pixels: np.ndarray) -> np.ndarray:
     """How far (L,) the keypoints of a point are from their true places, up to what all of them share."""
     points, point_of, images, rows = observations_of(reconstruction)
     found = np.array(
-        [reconstruction.image(i + 1).point2D(k).xy for i, k in zip(images.tolist(), rows.tolist())]
+        [
+            reconstruction.image(i + 1).point2D(k).xy
+            for i, k in zip(images.tolist(), rows.tolist(), strict=True)
+        ]
     )
     offsets = found - pixels[images, rows]
     sums = np.zeros((len(points), 2))
@@ -118,16 +123,16 @@ def test_keypoints_of_a_point_come_to_agree(scene, scale, least, most):
 def test_an_observation_of_something_else_is_dropped_and_an_image_of_another_look_is_not(scene):
     images = [image.copy() for image in scene[1]]
     other = texture(9)[:300, :400]
-    images[1][:, :120] = other[:, :120]
+    images[1][:, :100] = other[:, :100]
     images[4] = other
     reconstruction = model_of(scene, 0.2)
     refine_keypoints(reconstruction, read(images), np.ones(5), SETTINGS)
     _, _, owners, rows = observations_of(reconstruction)
-    hidden = scene[3][1][:, 0] < 110
+    hidden = scene[3][1][:, 0] < 90
     kept = np.isin(np.arange(150), rows[owners == 1])
-    assert hidden.sum() > 10
+    assert hidden.sum() > 5
     assert kept[hidden].mean() < 0.1
-    assert kept[scene[3][1][:, 0] > 130].mean() > 0.9
+    assert kept[scene[3][1][:, 0] > 110].mean() > 0.9
     # nothing in the fifth image looks like the others: it keeps its keypoints where they were
     assert (owners == 4).sum() == 150
 
