@@ -18,7 +18,7 @@ from snakesfm.bundle.model import observations_of
 Array = NDArray[Any]
 
 MIN_ALIGNED_SHARE = 0.75
-"""Where fewer of an image's observations can be aligned, the image is blurred or of another light."""
+"""Where fewer of the observations can be aligned, the image or the scene is blurred or of changing light."""
 STEP_PX = 1.0
 """How far apart the points are whose projections give the warps."""
 
@@ -31,7 +31,8 @@ def refine_keypoints(
 ) -> tuple[int, int]:
     """Align the observations of every point to the most central one, and move the image's keypoints there.
 
-    An observation that cannot be aligned, in an image where most can, does not show its point and goes.
+    An observation that cannot be aligned does not show its point: it is dropped, where most others of its
+    image and of the model can be.
 
     Parameters
     ----------
@@ -68,7 +69,9 @@ def refine_keypoints(
 
 
 def _droppable(images: Array, aligned: Array) -> Array:
-    """Observations (L,) bool that do not look like their point, in images where most can be aligned."""
+    """Observations (L,) bool that do not look like their point, in images and scenes where most do."""
+    if aligned.mean() < MIN_ALIGNED_SHARE:
+        return np.zeros(len(aligned), dtype=bool)
     counts = np.maximum(np.bincount(images), 1)
     shares = np.bincount(images, weights=aligned, minlength=len(counts)) / counts
     return ~aligned & (shares[images] >= MIN_ALIGNED_SHARE)

@@ -118,7 +118,7 @@ def adjust_rounds(
     for row, threshold in enumerate(settings.thresholds_px):
         refine_now = source is not None and row == max(last - 1, 0)
         # what completion adds is not refined, so it ends where refinement begins
-        if row and settings.complete_tracks and (source is None or row < last or refine_now):
+        if row and settings.complete_tracks and (source is None or row < last):
             mapper.completer()
         if source is not None and refine_now:
             source.report(
