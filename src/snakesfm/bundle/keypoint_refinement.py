@@ -18,7 +18,7 @@ from snakesfm.bundle.model import observations_of
 Array = NDArray[Any]
 
 MIN_ALIGNED_SHARE = 0.75
-"""Where fewer of the observations can be aligned, the image or the scene is blurred or of changing light."""
+"""Where fewer of the observations can be aligned, the image or scene is blurred or of changing light."""
 STEP_PX = 1.0
 """How far apart the points are whose projections give the warps."""
 
