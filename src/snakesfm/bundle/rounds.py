@@ -17,6 +17,7 @@ from snakesfm.bundle.filtering import (
     reset_wild_cameras,
 )
 from snakesfm.bundle.interface import BundleAdjuster, SolverSettings
+from snakesfm.bundle.principal_points import find_told_cameras
 from snakesfm.bundle.registration import register_left_out
 from snakesfm.geometry.camera import Camera
 
@@ -35,6 +36,9 @@ class RoundSettings:
     loss_scale_px: float | Literal["auto"] = "auto"
     loss_scale_sigmas: float = 2.4
     early_loss_share: float = 0.4
+    refine_principal_points: bool = True
+    max_principal_point_gap: float = 0.003
+    max_principal_point_offset: float = 0.02
     max_focal_change: float = 3.0
     max_distortion: float = 1.0
     complete_tracks: bool = True
@@ -99,6 +103,8 @@ def adjust_rounds(
         mapper.round(f"round {row + 1}", threshold, final=row == last)
     while settings.register_images and mapper.register():
         mapper.round("registration", settings.thresholds_px[-1], final=True)
+    if settings.refine_principal_points and settings.solver == "ceres":
+        mapper.refine_principal_points()
     return mapper.records
 
 
@@ -167,6 +173,24 @@ class _Mapper:
         )
         self.records.append(record)
         self.report(record)
+
+    def refine_principal_points(self) -> None:
+        """One more round in which the principal points that the model tells are free."""
+        solving = replace(self.solving, loss_scale_px=self.loss_scale_px())
+        told = find_told_cameras(
+            self.reconstruction,
+            self.adjust,
+            solving,
+            self.settings.max_principal_point_gap,
+            self.settings.max_principal_point_offset,
+        )
+        if not told:
+            return
+        before = self.solving
+        held = frozenset(self.reconstruction.cameras) - told
+        self.solving = replace(before, constant_cameras=held, refine_principal_points=True)
+        self.round("principal points", self.settings.thresholds_px[-1], final=True)
+        self.solving = before
 
     def loss_scale_px(self) -> float:
         """Where the loss of a final round sets in."""

@@ -10,7 +10,7 @@ from snakesfm.config.base import StageOptions
 class AdjustBundleOptions(StageOptions):
     """How cameras, poses and points are adjusted together."""
 
-    stage_version: ClassVar[int] = 2
+    stage_version: ClassVar[int] = 3
 
     solver: Literal["ceres", "gtsam"] = "ceres"
     """Least-squares solver: Ceres through pycolmap, or gtsam (slower, fewer camera models)."""
@@ -38,6 +38,15 @@ class AdjustBundleOptions(StageOptions):
 
     refine_distortion: bool = True
     """Refine the distortion of cameras that are not fixed."""
+
+    refine_principal_points: bool = True
+    """At the end, refine principal points of cameras that are not fixed, where the model tells them."""
+
+    max_principal_point_gap: float = Field(default=0.003, gt=0.0, le=1.0)
+    """Distance, over the longer side, up to which two halves of the points must tell it alike."""
+
+    max_principal_point_offset: float = Field(default=0.02, gt=0.0, le=1.0)
+    """Distance from the start, over the longer side, beyond which a principal point is not believed."""
 
     max_focal_change: float = Field(default=3.0, gt=1.0)
     """Factor by which a refined focal length may change before the camera is reset and held fixed."""
