@@ -36,6 +36,7 @@ class RoundSettings:
     loss_scale_px: float | Literal["auto"] = "auto"
     loss_scale_sigmas: float = 2.4
     early_loss_share: float = 0.4
+    distortion_from_round: int = 2
     refine_principal_points: bool = True
     max_principal_point_gap: float = 0.003
     max_principal_point_offset: float = 0.02
@@ -135,7 +136,11 @@ class _Mapper:
     def round(
         self, name: str, threshold_px: float, constant_rotations: bool = False, final: bool = False
     ) -> None:
-        """One pass of the solver and the filters after it; early passes are coarse and less robust."""
+        """One pass of the solver and the filters after it; early passes are coarse and less robust.
+
+        The first of several holds the distortion, which would make up for a wrong focal length. A camera
+        gone wild is held until the pass ends: the next one starts from better poses and points.
+        """
         settings = self.settings
         solving = replace(
             self.solving, constant_rotations=constant_rotations, loss_scale_px=self.loss_scale_px()
@@ -145,6 +150,8 @@ class _Mapper:
                 solving,
                 function_tolerance=solving.function_tolerance * EARLY_TOLERANCE,
                 loss_scale_px=settings.early_loss_share * threshold_px,
+                refine_distortion=solving.refine_distortion
+                and len(self.records) + 1 >= settings.distortion_from_round,
             )
         drop_short_tracks(self.reconstruction, settings.min_track_length)
         costs = self.adjust(self.reconstruction, solving)
@@ -152,8 +159,7 @@ class _Mapper:
             self.reconstruction, self.cameras, settings.max_focal_change, settings.max_distortion
         )
         if wild:
-            held = self.solving.constant_cameras | {row + 1 for row in wild}
-            self.solving = replace(self.solving, constant_cameras=held)
+            held = solving.constant_cameras | {row + 1 for row in wild}
             costs = self.adjust(self.reconstruction, replace(solving, constant_cameras=held))
         filter_observations(
             self.reconstruction, threshold_px, settings.min_angle_deg, settings.min_track_length
