@@ -14,7 +14,8 @@ class SolverSettings:
     ----------
     loss, loss_scale_px : robust loss on the norm of each reprojection error, and where it sets in.
     constant_cameras : ids of cameras whose intrinsics are held.
-    refine_focal, refine_distortion : which intrinsics of the others are free; principal points never are.
+    refine_focal, refine_distortion, refine_principal_points : which intrinsics of the others are free;
+        gtsam holds principal points.
     constant_rotations : hold all rotations.
     max_iterations, function_tolerance : when the solver stops.
     threads : of the solver.
@@ -25,6 +26,7 @@ class SolverSettings:
     constant_cameras: frozenset[int] = frozenset()
     refine_focal: bool = True
     refine_distortion: bool = True
+    refine_principal_points: bool = False
     constant_rotations: bool = False
     max_iterations: int = 100
     function_tolerance: float = 1e-6

@@ -19,6 +19,7 @@ from snakesfm.bundle.filtering import (
 )
 from snakesfm.bundle.interface import BundleAdjuster, SolverSettings
 from snakesfm.bundle.keypoint_refinement import refine_keypoints
+from snakesfm.bundle.principal_points import find_told_cameras
 from snakesfm.bundle.registration import register_left_out
 from snakesfm.geometry.camera import Camera
 
@@ -37,6 +38,10 @@ class RoundSettings:
     loss_scale_px: float | Literal["auto"] = "auto"
     loss_scale_sigmas: float = 3.5
     early_loss_share: float = 0.4
+    distortion_from_round: int = 2
+    refine_principal_points: bool = True
+    max_principal_point_gap: float = 0.003
+    max_principal_point_offset: float = 0.02
     max_focal_change: float = 3.0
     max_distortion: float = 1.0
     complete_tracks: bool = True
@@ -127,6 +132,8 @@ def adjust_rounds(
         mapper.round(f"round {row + 1}", threshold, final=row == last)
     while settings.register_images and mapper.register():
         mapper.round("registration", settings.thresholds_px[-1], final=True)
+    if settings.refine_principal_points and settings.solver == "ceres":
+        mapper.refine_principal_points()
     return mapper.records
 
 
@@ -157,7 +164,11 @@ class _Mapper:
     def round(
         self, name: str, threshold_px: float, constant_rotations: bool = False, final: bool = False
     ) -> None:
-        """One pass of the solver and the filters after it; early passes are coarse and less robust."""
+        """One pass of the solver and the filters after it; early passes are coarse and less robust.
+
+        The first of several holds the distortion, which would make up for a wrong focal length. A camera
+        gone wild is held until the pass ends: the next one starts from better poses and points.
+        """
         settings = self.settings
         solving = replace(
             self.solving, constant_rotations=constant_rotations, loss_scale_px=self.loss_scale_px()
@@ -167,6 +178,8 @@ class _Mapper:
                 solving,
                 function_tolerance=solving.function_tolerance * EARLY_TOLERANCE,
                 loss_scale_px=settings.early_loss_share * threshold_px,
+                refine_distortion=solving.refine_distortion
+                and len(self.records) + 1 >= settings.distortion_from_round,
             )
         drop_short_tracks(self.reconstruction, settings.min_track_length)
         costs = self.adjust(self.reconstruction, solving)
@@ -174,8 +187,7 @@ class _Mapper:
             self.reconstruction, self.cameras, settings.max_focal_change, settings.max_distortion
         )
         if wild:
-            held = self.solving.constant_cameras | {row + 1 for row in wild}
-            self.solving = replace(self.solving, constant_cameras=held)
+            held = solving.constant_cameras | {row + 1 for row in wild}
             costs = self.adjust(self.reconstruction, replace(solving, constant_cameras=held))
         filter_observations(
             self.reconstruction, threshold_px, settings.min_angle_deg, settings.min_track_length
@@ -195,6 +207,24 @@ class _Mapper:
         )
         self.records.append(record)
         self.report(record)
+
+    def refine_principal_points(self) -> None:
+        """One more round in which the principal points that the model tells are free."""
+        solving = replace(self.solving, loss_scale_px=self.loss_scale_px())
+        told = find_told_cameras(
+            self.reconstruction,
+            self.adjust,
+            solving,
+            self.settings.max_principal_point_gap,
+            self.settings.max_principal_point_offset,
+        )
+        if not told:
+            return
+        before = self.solving
+        held = frozenset(self.reconstruction.cameras) - told
+        self.solving = replace(before, constant_cameras=held, refine_principal_points=True)
+        self.round("principal points", self.settings.thresholds_px[-1], final=True)
+        self.solving = before
 
     def loss_scale_px(self) -> float:
         """Where the loss of a final round sets in."""

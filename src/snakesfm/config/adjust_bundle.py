@@ -10,7 +10,7 @@ from snakesfm.config.base import StageOptions
 class AdjustBundleOptions(StageOptions):
     """How cameras, poses and points are adjusted together."""
 
-    stage_version: ClassVar[int] = 3
+    stage_version: ClassVar[int] = 4
 
     solver: Literal["ceres", "gtsam"] = "ceres"
     """Least-squares solver: Ceres through pycolmap, or gtsam (slower, fewer camera models)."""
@@ -39,11 +39,23 @@ class AdjustBundleOptions(StageOptions):
     refine_distortion: bool = True
     """Refine the distortion of cameras that are not fixed."""
 
+    distortion_from_round: int = Field(default=2, ge=1)
+    """Round from which on distortion is refined, the last at the latest."""
+
+    refine_principal_points: bool = True
+    """At the end, refine principal points of cameras that are not fixed, where the model tells them."""
+
+    max_principal_point_gap: float = Field(default=0.003, gt=0.0, le=1.0)
+    """Distance, over the longer side, up to which two halves of the points must tell it alike."""
+
+    max_principal_point_offset: float = Field(default=0.02, gt=0.0, le=1.0)
+    """Distance from the start, over the longer side, beyond which a principal point is not believed."""
+
     max_focal_change: float = Field(default=3.0, gt=1.0)
-    """Factor by which a refined focal length may change before the camera is reset and held fixed."""
+    """Factor by which a focal length may change before the camera is reset and held in the pass."""
 
     max_distortion: float = Field(default=1.0, gt=0.0)
-    """Largest distortion parameter before the camera is reset and held fixed."""
+    """Largest distortion parameter before the camera is reset and held in the pass."""
 
     complete_tracks: bool = True
     """Between rounds, add observations to points, merge points, and make points of left-out matches."""

@@ -1,0 +1,88 @@
+"""When the rounds of bundle adjustment refine focal length and distortion."""
+
+from dataclasses import replace
+
+import cv2  # noqa: F401
+import numpy as np
+import pytest
+
+from snakesfm.bundle import rounds
+from snakesfm.bundle.completion import correspondence_graph
+from snakesfm.bundle.interface import SolverSettings
+from snakesfm.bundle.model import BundleModel, from_reconstruction, to_reconstruction
+from snakesfm.geometry.camera import Camera
+from snakesfm.synthetic.problems import make_problem
+
+TRUE = Camera("SIMPLE_RADIAL", 640, 480, (500.0, 320.0, 240.0, -0.05), "estimated")
+START = replace(TRUE, params=(560.0, 320.0, 240.0, 0.0))
+
+
+@pytest.fixture
+def passes(monkeypatch):
+    """What every pass of the solver was told, in order."""
+    told = []
+    adjuster = rounds.bundle_adjuster("ceres")
+
+    def adjust(reconstruction, settings):
+        told.append(settings)
+        return adjuster(reconstruction, settings)
+
+    monkeypatch.setattr(rounds, "bundle_adjuster", lambda solver: adjust)
+    return told
+
+
+def adjusted(solving=None, **changes):
+    """The camera that the rounds find from a wrong focal length without distortion."""
+    made = make_problem(12, 600, noise_px=0.2, camera=TRUE, seed=5)
+    model = BundleModel(
+        (START,),
+        made.camera_ids,
+        made.rotations,
+        made.translations,
+        made.points,
+        made.track_offsets,
+        made.track_image_ids,
+        made.track_keypoint_ids,
+    )
+    reconstruction = to_reconstruction(model, made.keypoints, [f"{k}.jpg" for k in range(12)])
+    rounds.adjust_rounds(
+        reconstruction,
+        correspondence_graph(made.keypoints, made.pairs, made.match_offsets, made.matches),
+        model.cameras,
+        solving or SolverSettings(),
+        rounds.RoundSettings(thresholds_px=(20.0, 5.0, 3.0), **changes),
+        lambda record: None,
+    )
+    return np.array(from_reconstruction(reconstruction, model).cameras[0].params)
+
+
+@pytest.mark.parametrize(("start", "rounds_with"), [(1, [1, 1, 1]), (2, [0, 1, 1]), (9, [0, 0, 1])])
+def test_distortion_is_held_in_the_rounds_before(passes, start, rounds_with):
+    params = adjusted(distortion_from_round=start)
+    assert [settings.refine_distortion for settings in passes[:3]] == rounds_with
+    np.testing.assert_allclose(params[0], 500.0, rtol=0.01)
+    np.testing.assert_allclose(params[3], -0.05, atol=0.01)
+    assert params[3] != 0.0
+
+
+def test_distortion_stays_held_where_it_is_switched_off(passes):
+    assert adjusted(SolverSettings(refine_distortion=False))[3] == 0.0
+    assert not any(settings.refine_distortion for settings in passes)
+
+
+def test_a_camera_gone_wild_is_free_again_in_the_next_pass(passes, monkeypatch):
+    reset = rounds.reset_wild_cameras
+    calls = []
+
+    def once(reconstruction, cameras, *limits):
+        calls.append(limits)
+        return reset(reconstruction, cameras, *((1.01, 1.0) if len(calls) == 1 else limits))
+
+    monkeypatch.setattr(rounds, "reset_wild_cameras", once)
+    params = adjusted()
+    assert [1 in settings.constant_cameras for settings in passes[:4]] == [False, True, False, False]
+    np.testing.assert_allclose(params[0], 500.0, rtol=0.01)
+
+
+def test_a_camera_that_is_always_wild_keeps_its_first_intrinsics():
+    np.testing.assert_array_equal(adjusted(max_focal_change=1.001), START.params)
