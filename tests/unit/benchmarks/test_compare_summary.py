@@ -98,18 +98,22 @@ def test_page_and_csv_hold_what_was_measured(results: list[Result]) -> None:
     peers = [result(GLOBAL, seed, 93.0, 1.0, SAME) for seed in range(3)]
     page = render_page([*results, *shared, *peers], {"cores": "2"}, "compare --seeds 3")
     assert "Measured 2026-01-02 with `compare --seeds 3`\non cores 2." in page
-    (line,) = [line for line in page.splitlines() if line.startswith("| castle* |")]
-    cells = [cell.strip() for cell in line.split("|")[1:-1]]
-    assert cells[1] == "+3.00"
-    assert cells[5:7] == ["8.0x", "2.5x"]
-    assert cells[8] == "-2.00"
-    assert cells[12] == "0.5x"
+    rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in page.splitlines()]
+    (gaps,) = [cells for cells in rows if cells[:1] == ["castle*"]]
+    assert (gaps[1], gaps[4], gaps[5]) == ("+3.00", "+0", "-2.00")
+    (speeds,) = [cells for cells in rows if cells[:2] == ["castle", "30"]]
+    # wall and processor time against incremental, GLOMAP and openMVG; then mapping
+    assert speeds[2:] == ["8.0x", "2.5x", "", "8.0x", "2.5x", "", "0.5x", "", "0.5x", ""]
+    assert (
+        "(a) own front-end, surveyed truth: better / equal (within 0.1) / worse in AUC: @1 1 / 0 / 0"
+        in page
+    )
     assert "| snakesfm | 30 | 91.00 (90.00..92.00) |" in page
     assert "colmap_global: 1 of 3 runs without a model (crashed by SIGSEGV)." in page
-    rows = list(csv.DictReader(io.StringIO(render_csv(results))))
-    assert len(rows) == len(results)
-    assert {row["failure"] for row in rows} == {"", "crashed by SIGSEGV"}
-    assert float(rows[0][AREA]) == 90.0
+    runs = list(csv.DictReader(io.StringIO(render_csv(results))))
+    assert len(runs) == len(results)
+    assert {row["failure"] for row in runs} == {"", "crashed by SIGSEGV"}
+    assert float(runs[0][AREA]) == 90.0
 
 
 def test_stage_costs_are_read_from_the_last_run_in_the_logs(tmp_path: Path) -> None:
