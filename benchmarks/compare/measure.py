@@ -30,7 +30,8 @@ class Cost:
     seconds : wall clock.
     cpu_seconds : processor time, user and system, of all its processes.
     peak_mib : resident memory: the largest sampled sum over the processes that ran at the same time, or
-        the largest single process, whichever is more; pages that processes share count several times.
+        the high-water mark of one process, whichever is more; pages that processes share count several
+        times.
     others : share of the machine's processor time that others used meanwhile, 0 to 1.
     """
 
@@ -99,7 +100,7 @@ def run_measured(command: list[str], folder: Path, log: Path, limit_s: float) ->
     cost = Cost(
         round(seconds, 2),
         round(cpu_seconds, 2),
-        round(max(peak, usage.ru_maxrss / 1024), 1),
+        round(peak, 1),
         round(min(max(others, 0.0), 1.0), 3),
     )
     if late:
@@ -128,14 +129,20 @@ def run_operation(operation: str, arguments: dict[str, Any], log: Path, limit_s:
 
 
 def _resident_mib(pid: int) -> float:
-    """Resident memory of a process and all below it, in MiB."""
-    total = 0
+    """Resident memory of a process and all below it, or the largest high-water mark of one, in MiB.
+
+    The system's own record (ru_maxrss) will not do: it holds what the process that started them used.
+    """
+    total, highest = 0, 0
     with contextlib.suppress(psutil.Error):
         top = psutil.Process(pid)
         for process in (top, *top.children(recursive=True)):
-            with contextlib.suppress(psutil.Error):
+            with contextlib.suppress(psutil.Error, OSError):
                 total += process.memory_info().rss
-    return total / 2**20
+                status = Path(f"/proc/{process.pid}/status").read_text("utf-8")
+                marks = [line.split()[1] for line in status.splitlines() if line.startswith("VmHWM:")]
+                highest = max([highest, *(1024 * int(mark) for mark in marks)])
+    return max(total, highest) / 2**20
 
 
 def _busy_seconds() -> float:
