@@ -3,6 +3,7 @@
 import argparse
 import os
 import shlex
+import signal
 import sys
 from pathlib import Path
 
@@ -105,5 +106,11 @@ def write_tables(folder: Path, page: Path | None) -> None:
     page.with_suffix(".csv").write_text(render_csv(results), "utf-8")
 
 
+def _stop(number: int, _: object) -> None:
+    """End as an exception does, so that what is being measured is ended too."""
+    sys.exit(128 + number)
+
+
 if __name__ == "__main__":
+    signal.signal(signal.SIGTERM, _stop)
     sys.exit(main(sys.argv[1:]))
