@@ -43,6 +43,22 @@ class RotationGraph:
             self.covariances[chosen],
         )
 
+    def thin(self, degree: int) -> "RotationGraph":
+        """The graph with about ``degree`` edges, evenly spaced, at every node that has more, if connected."""
+        ends = self.pairs.ravel()
+        order = np.argsort(ends, kind="stable")
+        counts = np.bincount(ends, minlength=self.node_count)
+        if counts.max() <= degree:
+            return self
+        places = np.arange(len(ends)) - np.repeat(np.cumsum(counts) - counts, counts)
+        many = np.repeat(counts, counts)
+        # the edge at a place is kept where its even spacing steps over an integer
+        stays = (places * degree) // many != ((places + 1) * degree) // many
+        chosen = np.zeros(len(self.pairs), dtype=bool)
+        chosen[order[(many <= degree) | stays] // 2] = True
+        thinned = self.subset(chosen)
+        return thinned if label_components(self.node_count, thinned.pairs).max() == 0 else self
+
 
 class RotationAverager(ABC):
     """Averages relative rotations to absolute ones."""

@@ -12,6 +12,9 @@ Array = NDArray[Any]
 DIRECT_DEGREE = 30
 """Mean degree up to which the sparse factor is small; denser graphs converge fast without one."""
 
+DENSE_SIZE = 1000
+"""Unknowns up to which a system of a denser graph is factored as a full matrix."""
+
 
 def world_residuals(pairs: Array, rotations: Array, averaged: Array) -> Array:
     """Residuals (E,3) in radians, log(R_j^T R_ij R_i), in the world's frame."""
@@ -84,14 +87,18 @@ def solve_anisotropic(node_count: int, pairs: Array, information: Array, residua
 
 def _solve_spd(matrix: Any, right: Array, mean_degree: float) -> Array:
     """Solution (n,k) of a sparse symmetric positive definite system."""
+    from scipy.linalg import cho_factor, cho_solve
     from scipy.sparse import diags_array
     from scipy.sparse.linalg import cg, splu
 
-    if mean_degree <= DIRECT_DEGREE or matrix.shape[0] <= 600:
+    if mean_degree <= DIRECT_DEGREE:
         factor = splu(
             matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
         )
         solution: Array = factor.solve(right)
+        return solution
+    if matrix.shape[0] <= DENSE_SIZE:
+        solution = cho_solve(cho_factor(matrix.toarray(), overwrite_a=True), right)
         return solution
     preconditioner = diags_array(1.0 / matrix.diagonal())
     matrix = matrix.tocsr()

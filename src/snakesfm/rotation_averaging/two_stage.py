@@ -8,12 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from snakesfm.geometry.rotations import log_so3
-from snakesfm.rotation_averaging.base import RotationAverager, RotationGraph, edge_residuals
+from snakesfm.rotation_averaging.base import RotationAverager, RotationGraph
 from snakesfm.rotation_averaging.irls import IrlsAverager
 from snakesfm.rotation_averaging.linear import apply_increments, solve_anisotropic, world_residuals
+from snakesfm.rotation_averaging.moves import CLEAN, SEARCH_DEGREE, contradicted_share, improve_rotations
 from snakesfm.rotation_averaging.noise import fill_covariances, fit_noise, squared_lengths, student_weights
-from snakesfm.rotation_averaging.rejection import residual_limit
-from snakesfm.rotation_averaging.reseat import reseat_nodes
+from snakesfm.rotation_averaging.rejection import contradiction, residual_limit
 from snakesfm.rotation_averaging.tree import tree_rotations
 
 Array = NDArray[Any]
@@ -21,11 +21,6 @@ Array = NDArray[Any]
 REFUSED = 1e-6
 """Weight of refused edges: none in effect, but the graph stays connected."""
 
-RESEATS = 3
-"""So often nodes are reseated, at most."""
-
-CLEAN = 0.03
-"""Part of the edges that may contradict a start for it to be taken without trying others."""
 
 
 @dataclass(frozen=True)
@@ -33,9 +28,10 @@ class TwoStageAverager(RotationAverager):
     """Robust averaging blind to covariances, then maximum likelihood with them on the edges that fit.
 
     A confident outlier spoils a single pass with covariances; after the robust stage it is refused. That
-    stage starts from two spanning trees, by inlier counts and by cycle messages, moves single nodes out of
-    local minima and keeps the result of least robust cost. The covariances are rescaled and floored as the
-    residuals demand; where there is none, the inlier count stands in.
+    stage starts from two spanning trees, by inlier counts and by cycle messages, moves single nodes and
+    weakly connected groups out of local minima and keeps the result that most inlier matches agree with. The
+    covariances are rescaled and floored as the residuals demand; where there is none, the inlier count
+    stands in.
 
     Parameters
     ----------
@@ -59,31 +55,31 @@ class TwoStageAverager(RotationAverager):
         return averaged
 
     def _search(self, graph: RotationGraph) -> Array:
-        """Rotations of the start that leads to the least robust cost."""
+        """Rotations of the start that most inlier matches agree with in the end."""
+        graph = graph.thin(SEARCH_DEGREE)
         best, best_cost = np.zeros((0, 3, 3)), np.inf
         for start in self._starts(graph):
-            averaged = self.robust.descend(graph, self.robust.straighten(graph, start))
-            cost = self.robust.cost(graph, averaged)
-            for _ in range(RESEATS):
-                moved = self.robust.descend(graph, reseat_nodes(graph, averaged, self.robust.scale_rad))
-                moved_cost = self.robust.cost(graph, moved)
-                if moved_cost >= 0.9999 * cost:
-                    break
-                averaged, cost = moved, moved_cost
+            averaged = improve_rotations(self.robust, graph, self.robust.straighten(graph, start))
+            cost = contradiction(graph, averaged, self.robust.scale_rad)
             if cost < best_cost:
                 best, best_cost = averaged, cost
-            angles = edge_residuals(graph.pairs, graph.rotations, best)
-            if np.mean(angles > 2.0 * self.robust.scale_rad) <= CLEAN:
+            if contradicted_share(self.robust, graph, best) <= CLEAN:
                 break
         return best
 
     def _starts(self, graph: RotationGraph) -> Iterator[Array]:
-        """Rotations along spanning trees, the cheaper one first."""
+        """Rotations along spanning trees of the edges that their cycles confirm.
+
+        First the tree of most inliers: edges of repeated structure confirm each other, but have fewer. Then
+        the tree of least error by cycle messages.
+        """
         from snakesfm.view_graph.cycles import find_cycles
         from snakesfm.view_graph.messages import edge_errors
 
-        yield tree_rotations(graph.node_count, graph.pairs, graph.rotations, 1.0 / graph.weights)
         cycles = find_cycles(graph.node_count, graph.pairs, graph.rotations)
+        unverified = np.where(np.isnan(cycles.smallest), 0.5, cycles.smallest > self.robust.scale_rad)
+        costs = graph.weights.min() / graph.weights + unverified
+        yield tree_rotations(graph.node_count, graph.pairs, graph.rotations, costs)
         errors = edge_errors(len(graph.pairs), cycles, graph.weights)
         unknown = np.radians(20.0)
         noise = np.radians(0.5) * np.sqrt(np.median(graph.weights) / graph.weights)

@@ -10,10 +10,16 @@ from numpy.typing import NDArray
 Array = NDArray[Any]
 
 CHUNK = 1 << 19
-"""Candidate triangles that are held in memory at once."""
+"""Candidate cycles that are held in memory at once."""
 
-STORED = 1 << 22
-"""Triangles up to which all are stored; beyond, every edge has a sample of its triangles."""
+PER_EDGE = 64
+"""Third images that are tried per edge: all of them where one end has no more neighbours."""
+
+FEWEST_PER_EDGE = 16
+"""The same in large dense graphs."""
+
+TRIED = 1 << 22
+"""Candidates up to which ``PER_EDGE`` are tried."""
 
 
 @dataclass(frozen=True)
@@ -24,8 +30,7 @@ class Cycles:
     ----------
     edges : (T,3) int32, rows of the edges (i, j), (j, k) and (i, k).
     errors : (T,) float32, angle in radians of R_ik^T R_jk R_ij.
-    smallest : (E,) float64, smallest error of all cycles of an edge in radians, NaN in no cycle; exact also
-        where ``edges`` is a sample.
+    smallest : (E,) float64, smallest error of an edge's cycles in radians, NaN in no cycle.
     """
 
     edges: Array
@@ -33,43 +38,44 @@ class Cycles:
     smallest: Array
 
 
-def find_cycles(node_count: int, pairs: Array, rotations: Array, stored: int = STORED) -> Cycles:
-    """Find all 3-cycles of a graph.
+def find_cycles(
+    node_count: int, pairs: Array, rotations: Array, per_edge: int = PER_EDGE, tried: int = TRIED
+) -> Cycles:
+    """Find the 3-cycles of a graph, or enough of them where it is dense.
 
-    Up to about ``stored`` cycles are kept. A denser graph (2,000 images all paired with each other) keeps
-    a sample that depends only on the cycles themselves, at least 16 per edge on average. Memory is bounded
-    by ``stored``, time by the number of cycles.
+    Every edge looks for cycles among the neighbours of its end of smaller degree: all of them up to
+    ``per_edge``, else as many, drawn evenly and depending on the edge alone. A graph with more edges than
+    fit ``tried`` candidates makes do with fewer per edge, so time is about linear in the edges.
 
     Parameters
     ----------
     node_count : N.
     pairs : (E,2) int, edges i < j, sorted and unique.
     rotations : (E,3,3) float64, j_from_i.
-
-    References
-    ----------
-    Chiba and Nishizeki, Arboricity and Subgraph Listing, 1985 (listing by the node of smaller degree).
     """
     pairs = np.asarray(pairs, dtype=np.int64).reshape(-1, 2)
-    degrees = np.bincount(pairs.ravel(), minlength=node_count)
-    bounds = degrees[pairs].min(axis=1) if len(pairs) else np.zeros(0, dtype=np.int64)
-    per_edge = np.inf if bounds.sum() <= 3 * stored else max(16.0, 3.0 * stored / len(pairs))
-    rates = np.minimum(1.0, per_edge / np.maximum(bounds, 1))
     rotations = np.asarray(rotations, dtype=np.float64).reshape(-1, 3, 3)
-    smallest = np.full(len(pairs), np.inf)
-    edges, errors = [np.zeros((0, 3), dtype=np.int32)], [np.zeros(0, dtype=np.float32)]
-    for triangles in _triangles(pairs, degrees):
-        angles = _cycle_angles(*(rotations[triangles[:, side]] for side in range(3)))
-        for side in range(3):
-            np.minimum.at(smallest, triangles[:, side], angles)
-        if np.isfinite(per_edge):
-            chosen = _uniform_of(triangles) < rates[triangles].max(axis=1)
-            triangles, angles = triangles[chosen], angles[chosen]
-        edges.append(triangles.astype(np.int32))
-        errors.append(angles.astype(np.float32))
-    return Cycles(
-        np.concatenate(edges), np.concatenate(errors), np.where(np.isinf(smallest), np.nan, smallest)
-    )
+    edge_count = len(pairs)
+    sample = int(np.clip(tried // max(edge_count, 1), min(FEWEST_PER_EDGE, per_edge), per_edge))
+    keys = [np.zeros(0, dtype=np.int64)]
+    for found in _candidates(node_count, pairs, sample):
+        keys.append(found)
+    distinct = np.unique(np.concatenate(keys))
+    edges = np.empty((len(distinct), 3), dtype=np.int32)
+    errors = np.empty(len(distinct), dtype=np.float32)
+    flat = pairs[:, 0] * node_count + pairs[:, 1]
+    for start in range(0, len(distinct), CHUNK):
+        # a cycle's key is the row of its edge (i, j) and the image k
+        first, last = np.divmod(distinct[start : start + CHUNK], max(node_count, 1))
+        second = np.searchsorted(flat, pairs[first, 1] * node_count + last)
+        third = np.searchsorted(flat, pairs[first, 0] * node_count + last)
+        rows = slice(start, start + len(first))
+        edges[rows] = np.stack([first, second, third], axis=1)
+        errors[rows] = _cycle_angles(rotations[first], rotations[second], rotations[third])
+    smallest = np.full(edge_count, np.inf)
+    for side in range(3):
+        np.minimum.at(smallest, edges[:, side], errors)
+    return Cycles(edges, errors, np.where(np.isinf(smallest), np.nan, smallest))
 
 
 def smallest_of(edge_count: int, cycles: Cycles, alive: Array) -> Array:
@@ -97,49 +103,36 @@ def median_of(edge_count: int, cycles: Cycles, alive: Array) -> Array:
     return medians
 
 
-def _triangles(pairs: Array, degrees: Array) -> Iterator[Array]:
-    """Triangles in chunks of (T,3) int64 edge rows (i, j), (j, k), (i, k)."""
+def _candidates(node_count: int, pairs: Array, sample: int) -> Iterator[Array]:
+    """Keys (T,) int64 of 3-cycles in chunks: row of the edge (i, j) times ``node_count``, plus k, i < j < k."""
     if len(pairs) == 0:
         return
-    node_count = len(degrees)
-    # each edge points to its end of larger degree, so no node has many outgoing edges
-    ranks = np.empty(node_count, dtype=np.int64)
-    ranks[np.lexsort((np.arange(node_count), degrees))] = np.arange(node_count)
-    directed = np.sort(ranks[pairs], axis=1)
-    order = np.lexsort((directed[:, 1], directed[:, 0]))
-    tails, heads = directed[order].T
-    keys = tails * node_count + heads
-    ends = np.cumsum(np.bincount(tails, minlength=node_count))
-    followers = ends[tails] - np.arange(len(tails)) - 1
-    totals = np.cumsum(followers)
-    start = 0
-    while start < len(tails):
-        done = totals[start - 1] if start else 0
-        stop = max(start + 1, int(np.searchsorted(totals, done + CHUNK, side="right")))
-        first = np.repeat(np.arange(start, stop), followers[start:stop])
-        offset = np.arange(len(first)) - np.repeat(
-            totals[start:stop] - followers[start:stop] - done, followers[start:stop]
-        )
-        second = first + 1 + offset
-        wanted = heads[first] * node_count + heads[second]
-        third = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
-        found = keys[third] == wanted
-        rows = order[np.stack([first[found], second[found], third[found]], axis=1)]
-        # rows in the order of sorted pairs: (i, j) < (i, k) < (j, k) for i < j < k
-        rows.sort(axis=1)
-        if len(rows):
-            yield rows[:, [0, 2, 1]]
-        start = stop
-
-
-def _uniform_of(triangles: Array) -> Array:
-    """A pseudo-random number in [0, 1) per triangle that depends on its edges only."""
-    mixed = triangles.astype(np.uint64) @ np.array(
-        [0x9E3779B97F4A7C15, 0xBF58476D1CE4E5B9, 0x94D049BB133111EB], dtype=np.uint64
-    )
-    mixed ^= mixed >> np.uint64(31)
-    mixed *= np.uint64(0xD6E8FEB86659FD93)
-    return (mixed >> np.uint64(11)) * 2.0**-53
+    heads, tails = pairs.T
+    ends = np.concatenate([heads, tails])
+    order = np.lexsort((np.concatenate([tails, heads]), ends))
+    neighbours = np.concatenate([tails, heads])[order]
+    degrees = np.bincount(ends, minlength=node_count)
+    offsets = np.cumsum(degrees) - degrees
+    flat = heads * node_count + tails
+    swapped = degrees[heads] > degrees[tails]
+    near, far = np.where(swapped, tails, heads), np.where(swapped, heads, tails)
+    rows_per_chunk = max(1, CHUNK // sample)
+    for start in range(0, len(pairs), rows_per_chunk):
+        rows = np.arange(start, min(start + rows_per_chunk, len(pairs)))
+        available = degrees[near[rows]]
+        counts = np.minimum(available, sample)
+        row = np.repeat(rows, counts)
+        step = np.arange(len(row)) - np.repeat(np.cumsum(counts) - counts, counts)
+        # evenly spaced neighbours from a place of the edge's own
+        spread = (step * np.repeat(available, counts)) // np.repeat(counts, counts)
+        place = (spread + row * 0x9E3779B1) % np.repeat(available, counts)
+        place = np.where(np.repeat(available, counts) > sample, place, step)
+        third = neighbours[offsets[near[row]] + place]
+        wanted = np.minimum(far[row], third) * node_count + np.maximum(far[row], third)
+        found = np.minimum(np.searchsorted(flat, wanted), len(flat) - 1)
+        closed = (flat[found] == wanted) & (third != far[row])
+        nodes = np.sort(np.stack([near[row], far[row], third], axis=1)[closed], axis=1)
+        yield np.searchsorted(flat, nodes[:, 0] * node_count + nodes[:, 1]) * node_count + nodes[:, 2]
 
 
 def _cycle_angles(r01: Array, r12: Array, r02: Array) -> Array:

@@ -4,15 +4,17 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from snakesfm.geometry.rotations import angle_of
+from snakesfm.geometry.rotations import angle_of, exp_so3, log_so3
 from snakesfm.rotation_averaging.base import RotationGraph, edge_residuals
 from snakesfm.rotation_averaging.irls import IrlsAverager
 from snakesfm.rotation_averaging.linear import solve_anisotropic, solve_isotropic
 from snakesfm.rotation_averaging.noise import fill_covariances, fit_noise
+from snakesfm.rotation_averaging.regroup import regroup_nodes
 from snakesfm.rotation_averaging.rejection import residual_limit
 from snakesfm.rotation_averaging.reseat import reseat_nodes
 from snakesfm.rotation_averaging.tree import tree_rotations
 from snakesfm.rotation_averaging.two_stage import TwoStageAverager
+from snakesfm.rotation_averaging.verification import average_view_graph
 
 
 def random_graph(node_count, edge_count, seed, node_bias=None):
@@ -135,3 +137,82 @@ def test_confident_outliers_do_not_spoil_the_gain_of_covariances():
         mean = Rotation.from_matrix(gauge).mean().as_matrix()
         errors[type(averager)] = np.degrees(angle_of(gauge @ mean.T)).mean()
     assert 0.05 < errors[TwoStageAverager] < 0.75 * errors[IrlsAverager]
+
+
+def test_a_group_on_one_wrong_edge_is_joined_by_its_right_ones():
+    rng = np.random.default_rng(11)
+    truth = Rotation.random(12, rng).as_matrix()
+    inside = [(i, j) for i in range(12) for j in range(i + 1, 12) if (i < 6) == (j < 6)]
+    pairs = np.array(sorted([*inside, (0, 6), (1, 8), (4, 11)]))
+    rotations = truth[pairs[:, 1]] @ truth[pairs[:, 0]].transpose(0, 2, 1)
+    turn = Rotation.from_rotvec([0, 1.5, 0]).as_matrix()
+    wrong = (pairs == (1, 8)).all(axis=1)
+    rotations[wrong] = turn @ rotations[wrong]
+    weights = np.where(wrong, 150.0, 50.0)
+    graph = RotationGraph(12, pairs, rotations, weights, np.full((len(pairs), 3, 3), np.nan))
+    held = truth.copy()
+    held[6:] = truth[6:] @ (truth[8].T @ turn @ truth[8])
+    assert edge_residuals(pairs, rotations, held)[wrong].max() < 1e-6
+    joined = regroup_nodes(graph, held, 0.17)
+    gauge = joined[0].T @ truth[0]
+    assert angle_of(joined @ gauge @ truth.transpose(0, 2, 1)).max() < 1e-3
+
+
+def test_dense_graphs_are_thinned_and_stay_connected():
+    pairs, rotations, _ = random_graph(60, 3000, 12)
+    graph = RotationGraph(60, pairs, rotations, np.ones(len(pairs)), np.full((len(pairs), 3, 3), np.nan))
+    thin = graph.thin(10)
+    degrees = np.bincount(thin.pairs.ravel(), minlength=60)
+    assert degrees.min() >= 10 and len(thin.pairs) <= 600 < len(pairs)
+    assert graph.thin(60) is graph
+
+
+def test_refused_edges_that_agree_are_taken_back_and_wrong_ones_refused():
+    pairs, rotations, truth = random_graph(40, 300, 13)
+    rng = np.random.default_rng(14)
+    wrong = (rng.uniform(size=len(pairs)) < 0.25) & (pairs[:, 1] - pairs[:, 0] > 1)
+    rotations[wrong] = Rotation.random(int(wrong.sum()), rng).as_matrix()
+    filtered = np.where(wrong ^ (rng.uniform(size=len(pairs)) < 0.1), "cycle_message", "kept").astype(object)
+    filtered[pairs[:, 1] - pairs[:, 0] == 1] = "kept"
+    graph = RotationGraph(40, pairs, rotations, np.ones(len(pairs)), np.full((len(pairs), 3, 3), np.nan))
+    averaged, reasons, components = average_view_graph(TwoStageAverager(), graph, filtered, 5.0, 10.0, 2, 0)
+    assert (components == 0).all()
+    assert (reasons[~wrong] == "kept").all()
+    assert np.mean(reasons[wrong] == "kept") < 0.05
+    assert set(reasons) == {"kept", "rotation_residual", "cycle_message"}
+    gauge = averaged[0].T @ truth[0]
+    assert np.degrees(angle_of(averaged @ gauge @ truth.transpose(0, 2, 1))).max() < 0.1
+
+
+def network(seed, outliers):
+    """A ring of 80 cameras: noise by inlier count, wrong edges as sure as right ones."""
+    rng = np.random.default_rng(seed)
+    pairs = np.unique(
+        np.sort(np.array([(i, (i + step) % 80) for i in range(80) for step in range(1, 9)]), axis=1), axis=0
+    )
+    truth = Rotation.random(80, rng).as_matrix()
+    counts = np.exp(rng.uniform(np.log(20), np.log(800), len(pairs)))
+    sigmas = np.radians(4.0) / np.sqrt(counts) * np.exp(rng.normal(0, 0.5, len(pairs)))
+    noise = Rotation.from_rotvec(sigmas[:, None] * rng.normal(size=(len(pairs), 3))).as_matrix()
+    exact = truth[pairs[:, 1]] @ truth[pairs[:, 0]].transpose(0, 2, 1)
+    wrong = rng.uniform(size=len(pairs)) < outliers
+    exact[wrong] = Rotation.random(int(wrong.sum()), rng).as_matrix()
+    return pairs, noise @ exact, counts, sigmas[:, None, None] ** 2 * np.eye(3), truth, sigmas, wrong
+
+
+@pytest.mark.parametrize("outliers", [0.0, 0.2, 0.4])
+def test_networks_are_averaged_nearly_as_well_as_without_outliers(outliers):
+    pairs, rotations, counts, covariances, truth, sigmas, wrong = network(15, outliers)
+    averaged = TwoStageAverager().average(80, pairs, rotations, counts, covariances)
+    best = truth
+    for _ in range(3):
+        tails = best[pairs[~wrong, 1]]
+        information = np.eye(3) / sigmas[~wrong, None, None] ** 2
+        residuals = log_so3(tails.transpose(0, 2, 1) @ rotations[~wrong] @ best[pairs[~wrong, 0]])
+        best = best @ exp_so3(solve_anisotropic(80, pairs[~wrong], information, residuals))
+    errors = []
+    for solution in (averaged, best):
+        gauge = solution.transpose(0, 2, 1) @ truth
+        errors.append(np.degrees(angle_of(gauge @ Rotation.from_matrix(gauge).mean().as_matrix().T)).mean())
+    assert 0.02 < errors[1] < 0.5
+    assert 0.9 * errors[1] < errors[0] < 1.4 * errors[1]

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from snakesfm.geometry.rotations import angle_of
 from snakesfm.view_graph import cycles as cycles_module
+from snakesfm.view_graph.bridges import find_bridges
 from snakesfm.view_graph.components import label_components
 from snakesfm.view_graph.cycles import find_cycles, median_of, smallest_of
 from snakesfm.view_graph.filters import (
@@ -87,16 +88,30 @@ def test_cycles_agree_with_brute_force(monkeypatch, chunk):
             assert np.isnan(cycles.smallest[edge]) and np.isnan(medians[edge])
 
 
-def test_sampled_cycles_are_fewer_and_their_minimum_is_exact():
+def test_sampled_cycles_are_real_and_bounded():
     pairs, rotations, _ = noisy_graph(80, 1.0, 2)
-    full, sampled = find_cycles(80, pairs, rotations), find_cycles(80, pairs, rotations, stored=20_000)
+    full, sampled = find_cycles(80, pairs, rotations, per_edge=80), find_cycles(80, pairs, rotations, per_edge=8)
     assert len(full.edges) == 80 * 79 * 78 // 6
-    assert 10_000 < len(sampled.edges) < 40_000
-    np.testing.assert_array_equal(full.smallest, sampled.smallest)
+    assert 4 * len(pairs) < len(sampled.edges) <= 8 * len(pairs)
+    every = {tuple(row): error for row, error in zip(full.edges.tolist(), full.errors, strict=True)}
+    assert all(every[tuple(row)] == error for row, error in zip(sampled.edges.tolist(), sampled.errors, strict=True))
+    assert np.bincount(sampled.edges.ravel(), minlength=len(pairs)).min() >= 7
     alive = np.ones(len(pairs), dtype=bool)
     difference = median_of(len(pairs), full, alive) - median_of(len(pairs), sampled, alive)
     assert np.degrees(np.abs(difference)).max() < 1.0
-    assert (smallest_of(len(pairs), sampled, alive) >= full.smallest - 1e-6).all()
+    assert (sampled.smallest >= full.smallest - 1e-6).all()
+    np.testing.assert_array_equal(smallest_of(len(pairs), sampled, alive), sampled.smallest)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_bridges_are_what_disconnects(seed):
+    rng = np.random.default_rng(seed)
+    pairs = np.unique(np.sort(rng.integers(0, 40, (42, 2)), axis=1), axis=0)
+    pairs = pairs[pairs[:, 0] != pairs[:, 1]]
+    parts = label_components(40, pairs).max()
+    expected = [label_components(40, np.delete(pairs, row, axis=0)).max() > parts for row in range(len(pairs))]
+    assert 0 < sum(expected) < len(pairs)
+    np.testing.assert_array_equal(find_bridges(40, pairs), expected)
 
 
 def test_graph_without_edges_or_cycles():

@@ -1,0 +1,1 @@
+"""The back-end alone, on view graphs with known truth and known outliers, against COLMAP's."""

@@ -1,0 +1,83 @@
+"""Averaging a filtered view graph: rotations, and which edges agree with them, refused ones included."""
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from snakesfm.rotation_averaging.base import RotationAverager, RotationGraph, edge_residuals
+from snakesfm.rotation_averaging.irls import IrlsAverager
+from snakesfm.rotation_averaging.moves import SEARCH_DEGREE, improve_rotations
+from snakesfm.rotation_averaging.rejection import residual_limit
+from snakesfm.view_graph.filters import keep_largest_component
+
+Array = NDArray[Any]
+
+
+
+def average_view_graph(
+    averager: RotationAverager,
+    graph: RotationGraph,
+    reasons: Array,
+    smallest_limit_deg: float,
+    largest_limit_deg: float,
+    passes: int,
+    seed: int,
+) -> tuple[Array, Array, Array]:
+    """Average the kept edges, then take back refused ones that agree, and refuse kept ones that do not.
+
+    What the filter refused has its say in between: the averaged rotations descend on the robust cost of all
+    edges, so that a filter's wrong choices do no harm.
+
+    Parameters
+    ----------
+    graph : all N images and E edges; need not be connected.
+    reasons : (E,) str, ``kept`` or what refused an edge.
+    smallest_limit_deg, largest_limit_deg : bounds of the residual above which an edge is refused.
+    passes : how often is averaged, at most, and edges judged after it.
+
+    Returns
+    -------
+    rotations : (N,3,3) cam_from_world, NaN outside of the largest component of the kept edges.
+    reasons : (E,) str; ``rotation_residual`` and ``component`` where refused here.
+    components : (N,) int32, 0 the largest.
+    """
+
+    def average(chosen: Array) -> Array:
+        part = graph.subset(chosen)
+        return averager.average(
+            part.node_count, part.pairs, part.rotations, part.weights, part.covariances, seed
+        )
+
+    kept = reasons == "kept"
+    components = keep_largest_component(graph.node_count, graph.pairs, reasons)[1]
+    rotations = average(kept)
+    judging = rotations if kept.all() else _improve_on_all(graph, rotations)
+    for remaining in range(passes - 1, -1, -1):
+        residuals = np.degrees(edge_residuals(graph.pairs, graph.rotations, judging))
+        fits = residuals <= residual_limit(residuals[kept], smallest_limit_deg, largest_limit_deg)
+        if not fits.any():
+            # nothing agrees with anything: better some rotations, labelled by their residuals, than none
+            break
+        before = kept
+        reasons = np.where(fits, "kept", np.where(kept, "rotation_residual", reasons)).astype(object)
+        reasons, components = keep_largest_component(graph.node_count, graph.pairs, reasons)
+        kept = reasons == "kept"
+        if np.array_equal(kept, before) or remaining == 0:
+            break
+        rotations = judging = average(kept)
+    rotations[components != 0] = np.nan
+    first = np.flatnonzero(components == 0)[0]
+    return rotations @ rotations[first].T, reasons, components
+
+
+def _improve_on_all(graph: RotationGraph, rotations: Array) -> Array:
+    """Rotations (N,3,3) that suit all edges between nodes with a rotation better."""
+    known = np.isfinite(rotations[:, 0, 0])
+    numbers = np.cumsum(known) - 1
+    part = graph.subset(known[graph.pairs].all(axis=1))
+    part = replace(part, node_count=int(known.sum()), pairs=numbers[part.pairs])
+    improved = rotations.copy()
+    improved[known] = improve_rotations(IrlsAverager(), part.thin(SEARCH_DEGREE), rotations[known])
+    return improved
