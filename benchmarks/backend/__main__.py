@@ -2,8 +2,8 @@
 
     python -m benchmarks.backend [--sizes 50 300 1000] [--outliers 0 0.1 0.2 0.3 0.4] [--seeds 3]
 
-Needs ViewGraphForge (``pip install -e '.[bench]'``). Every method runs in a process of its own with limits on
-time and memory, so one that fails is one row.
+Needs ViewGraphForge (``pip install -e '.[bench]'``). Every method runs in a process of its own with limits
+on time and memory, so one that fails is one row.
 """
 
 import argparse
@@ -149,17 +149,20 @@ def render(rows: list[dict[str, Any]], command: str) -> str:
         f"{date.today().isoformat()}, {os.cpu_count()} cores, {platform.machine()}, Python"
         f" {platform.python_version()}, {versions}. Made by `python -m benchmarks.backend {command}`.",
         "",
-        "Rotation errors in degrees after alignment by the median rotation: median over seeds of the mean error"
-        " (smallest to largest), and of the median error. *Ratio* is to COLMAP's default in the same row group,"
-        " mean and median. *Oracle* is weighted least squares on the right edges alone, started at the truth."
+        "Rotation errors in degrees after alignment by the median rotation: median over seeds of the mean"
+        " error (smallest to largest), and of the median error. *Ratio* is to COLMAP's default on the same"
+        " problems. *Oracle* is weighted least squares on the right edges alone, started at the truth."
         " Seconds are of the processor.",
         "",
-        "| problem | cameras | outliers | coherent | method | images | mean | ratio | median | ratio | s | MiB |",
+        "| problem | cameras | outliers | coherent | method | images"
+        " | mean | ratio | median | ratio | s | MiB |",
         "|---|---|---|---|---|---|---|---|---|---|---|---|",
     ]
     groups: dict[tuple[Any, ...], list[dict[str, Any]]] = defaultdict(list)
     for row in rows:
-        groups[tuple(row[key] for key in ("problem", "cameras", "outliers", "coherent", "method"))].append(row)
+        groups[tuple(row[key] for key in ("problem", "cameras", "outliers", "coherent", "method"))].append(
+            row
+        )
     for key, group in groups.items():
         name, cameras, outliers, coherent, method = key
         done = [row for row in group if not row["failure"]]

@@ -1,4 +1,4 @@
-"""What is compared: snakesfm's filters and averagers in all combinations, pycolmap's, and the best possible."""
+"""What is compared: snakesfm's filters and averagers, pycolmap's, and the best possible."""
 
 from collections.abc import Callable
 from typing import Any
@@ -26,7 +26,7 @@ CYCLE_ERROR_RAD = np.radians(7.0)
 
 
 def snakesfm_rotations(problem: Problem, filtering: str, averaging: str) -> Array:
-    """The stages filter_view_graph (``none``, ``cycles``, ``messages``) and average_rotations, with defaults."""
+    """What filter_view_graph (or ``none``) and average_rotations do with their defaults."""
     node_count, pairs = len(problem.truth), problem.pairs
     reasons = np.full(len(pairs), "kept", dtype=object)
     if filtering != "none":
@@ -51,7 +51,7 @@ def snakesfm_rotations(problem: Problem, filtering: str, averaging: str) -> Arra
 
 
 def colmap_rotations(problem: Problem, reweighting: str) -> Array:
-    """pycolmap's rotation averaging with its default options but for ``reweighting``."""
+    """Rotation averaging of pycolmap with its default options but for ``reweighting``."""
     from snakesfm.geometry.colmap_binding import pycolmap
 
     pycolmap.logging.minloglevel = 3
@@ -60,9 +60,7 @@ def colmap_rotations(problem: Problem, reweighting: str) -> Array:
         pycolmap.Camera(camera_id=1, model="PINHOLE", width=2, height=2, params=[1, 1, 1, 1])
     )
     for image in range(len(problem.truth)):
-        model.add_image_with_trivial_frame(
-            pycolmap.Image(name=str(image), camera_id=1, image_id=image + 1)
-        )
+        model.add_image_with_trivial_frame(pycolmap.Image(name=str(image), camera_id=1, image_id=image + 1))
     graph = pycolmap.PoseGraph()
     for (i, j), rotation, translation, count in zip(
         problem.pairs.tolist(), problem.rotations, problem.translations, problem.counts, strict=True
@@ -82,7 +80,7 @@ def colmap_rotations(problem: Problem, reweighting: str) -> Array:
 
 
 def oracle_rotations(problem: Problem) -> Array:
-    """Weighted least squares from the truth on the edges that are not wrong: what no method can beat by much."""
+    """Weighted least squares from the truth on the edges that are not wrong: hardly to be beaten."""
     right = ~problem.wrong
     covariances = fill_covariances(problem.covariances[:, :3, :3], np.maximum(problem.counts, 1.0))
     information = np.linalg.inv(covariances)

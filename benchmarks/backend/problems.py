@@ -39,7 +39,7 @@ class Problem:
     rotations : (E,3,3) j_from_i.
     translations : (E,3) unit, of j_from_i.
     counts : (E,) inlier matches.
-    covariances : (E,5,5) rad^2, of the rotation's left increment and the direction's tangents; NaN if unknown.
+    covariances : (E,5,5) rad^2, of the rotation's left increment and of direction's tangents; NaN: unknown.
     wrong : (E,) bool, edges that are no measurement of the true pose.
     truth : (N,3,3) cam_from_world, NaN where unknown.
     centers : (N,3).
@@ -80,7 +80,7 @@ class Problem:
 def forge(
     family: str, cameras: int, outliers: float, coherent: bool, seed: int, noise: str = "analytic"
 ) -> Problem:
-    """A graph of ViewGraphForge; both parts of its random outliers are wrong, whatever their inlier count."""
+    """A graph of ViewGraphForge; its random outliers do not depend on the inlier count."""
     import viewgraphforge
 
     parameters: dict[str, Any] = {
@@ -129,8 +129,8 @@ def forge(
 def synthesize(cameras: int, outliers: float, seed: int) -> Problem:
     """A full problem of pycolmap, whose relative poses and covariances snakesfm's own estimator finds.
 
-    The noise of an image's keypoints is the same in all its pairs, as in real images; a tenth of the matches
-    of every pair is wrong. Each camera is paired with about 20 others.
+    The noise of an image's keypoints is the same in all its pairs, as in real images; a tenth of the
+    matches of every pair is wrong. Each camera is paired with about 20 others.
     """
     from snakesfm.config.estimate_two_view import EstimateTwoViewOptions
     from snakesfm.geometry.camera import Camera
@@ -144,7 +144,9 @@ def synthesize(cameras: int, outliers: float, seed: int) -> Problem:
     model = pycolmap.synthesize_dataset(options)
     rng = np.random.default_rng(seed)
     parameters = model.cameras[1].params
-    camera = Camera(model.cameras[1].model.name, model.cameras[1].width, model.cameras[1].height, tuple(parameters))
+    camera = Camera(
+        model.cameras[1].model.name, model.cameras[1].width, model.cameras[1].height, tuple(parameters)
+    )
     truth, centers, keypoints, seen = [], [], [], []
     for number in sorted(model.images):
         image = model.images[number]

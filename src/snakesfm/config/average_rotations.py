@@ -1,6 +1,6 @@
 """Options of average_rotations."""
 
-from typing import Literal
+from typing import ClassVar, Literal
 
 from pydantic import Field
 
@@ -9,6 +9,8 @@ from snakesfm.config.base import StageOptions
 
 class AverageRotationsOptions(StageOptions):
     """Options of averaging relative rotations to absolute ones."""
+
+    stage_version: ClassVar[int] = 2
 
     method: Literal["two_stage", "irls", "shonan"] = "two_stage"
     """Averager: robust pass and covariance-weighted refinement, L1 and IRLS only, or Shonan averaging."""
@@ -20,4 +22,4 @@ class AverageRotationsOptions(StageOptions):
     """The limit adapts to the residuals of the scene, but not below so many degrees."""
 
     passes: int = Field(default=2, ge=1, le=5)
-    """How often the rotations are averaged; edges are refused by their residuals after each time."""
+    """How often the rotations are averaged; then edges are refused or taken back by residuals."""

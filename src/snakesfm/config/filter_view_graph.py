@@ -1,6 +1,6 @@
 """Options of filter_view_graph."""
 
-from typing import Literal
+from typing import ClassVar, Literal
 
 from pydantic import Field
 
@@ -9,6 +9,8 @@ from snakesfm.config.base import StageOptions
 
 class FilterViewGraphOptions(StageOptions):
     """Options of refusing edges of the view graph that contradict the others."""
+
+    stage_version: ClassVar[int] = 2
 
     method: Literal["message_passing", "cycles"] = "message_passing"
     """How 3-cycles refuse edges: by message passing between them, or by the paper's two passes."""

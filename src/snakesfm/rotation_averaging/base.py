@@ -44,7 +44,7 @@ class RotationGraph:
         )
 
     def thin(self, degree: int) -> "RotationGraph":
-        """The graph with about ``degree`` edges, evenly spaced, at every node that has more, if connected."""
+        """The graph with about ``degree`` evenly spaced edges at every node that has more, if connected."""
         ends = self.pairs.ravel()
         order = np.argsort(ends, kind="stable")
         counts = np.bincount(ends, minlength=self.node_count)

@@ -98,8 +98,7 @@ def _solve_spd(matrix: Any, right: Array, mean_degree: float) -> Array:
         solution: Array = factor.solve(right)
         return solution
     if matrix.shape[0] <= DENSE_SIZE:
-        solution = cho_solve(cho_factor(matrix.toarray(), overwrite_a=True), right)
-        return solution
+        return np.asarray(cho_solve(cho_factor(matrix.toarray(), overwrite_a=True), right))
     preconditioner = diags_array(1.0 / matrix.diagonal())
     matrix = matrix.tocsr()
     columns = [cg(matrix, column, rtol=1e-6, maxiter=2000, M=preconditioner)[0] for column in right.T]

@@ -1,4 +1,4 @@
-"""Leaving local minima: robust descent in turns with moves of single nodes and of weakly connected groups."""
+"""Leaving local minima: descent in turns with moves of single nodes and of weakly connected groups."""
 
 from collections.abc import Callable
 from typing import Any
@@ -42,7 +42,9 @@ def contradicted_share(robust: IrlsAverager, graph: RotationGraph, averaged: Arr
     return float(np.mean(angles > 2.0 * robust.scale_rad))
 
 
-def _repeat(robust: IrlsAverager, graph: RotationGraph, averaged: Array, move: Move, scale_rad: float) -> Array:
+def _repeat(
+    robust: IrlsAverager, graph: RotationGraph, averaged: Array, move: Move, scale_rad: float
+) -> Array:
     cost = robust.cost(graph, averaged)
     for _ in range(MOVES):
         moved = robust.descend(graph, move(graph, averaged, scale_rad))

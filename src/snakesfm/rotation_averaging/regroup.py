@@ -1,4 +1,4 @@
-"""Groups of rotations that hang together by single edges, joined anew by a vote of all edges between them."""
+"""Groups of rotations that hang together by single edges, joined anew by a vote of all edges."""
 
 from typing import Any
 

@@ -30,8 +30,9 @@ def residual_limit(residuals: Array, smallest: float, largest: float) -> float:
 def contradiction(graph: RotationGraph, averaged: Array, scale_rad: float) -> float:
     """How many inlier matches contradict rotations (N,3,3), softly counted about ``scale_rad``.
 
-    Unlike the cost that is descended, which takes the roots of the weights, this compares whole solutions:
-    edges of repeated structure agree with each other, so that their number says little, but have fewer matches.
+    Unlike the cost that is descended, which takes the roots of the weights, this compares whole
+    solutions: edges of repeated structure agree with each other, so that their number says little, but
+    have fewer matches.
     Edges at a node without rotation count in full.
     """
     angles = edge_residuals(graph.pairs, graph.rotations, averaged)

@@ -22,16 +22,15 @@ REFUSED = 1e-6
 """Weight of refused edges: none in effect, but the graph stays connected."""
 
 
-
 @dataclass(frozen=True)
 class TwoStageAverager(RotationAverager):
     """Robust averaging blind to covariances, then maximum likelihood with them on the edges that fit.
 
     A confident outlier spoils a single pass with covariances; after the robust stage it is refused. That
     stage starts from two spanning trees, by inlier counts and by cycle messages, moves single nodes and
-    weakly connected groups out of local minima and keeps the result that most inlier matches agree with. The
-    covariances are rescaled and floored as the residuals demand; where there is none, the inlier count
-    stands in.
+    weakly connected groups out of local minima and keeps the result that most inlier matches agree with.
+    The covariances are rescaled and floored as the residuals demand; where there is none, the inlier
+    count stands in.
 
     Parameters
     ----------

@@ -15,7 +15,6 @@ from snakesfm.view_graph.filters import keep_largest_component
 Array = NDArray[Any]
 
 
-
 def average_view_graph(
     averager: RotationAverager,
     graph: RotationGraph,
@@ -76,7 +75,8 @@ def _improve_on_all(graph: RotationGraph, rotations: Array) -> Array:
     """Rotations (N,3,3) that suit all edges between nodes with a rotation better."""
     known = np.isfinite(rotations[:, 0, 0])
     numbers = np.cumsum(known) - 1
-    part = graph.subset(known[graph.pairs].all(axis=1))
+    inside = np.asarray(known[graph.pairs].all(axis=1))
+    part = graph.subset(inside)
     part = replace(part, node_count=int(known.sum()), pairs=numbers[part.pairs])
     improved = rotations.copy()
     improved[known] = improve_rotations(IrlsAverager(), part.thin(SEARCH_DEGREE), rotations[known])

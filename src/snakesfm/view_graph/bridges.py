@@ -11,8 +11,8 @@ Array = NDArray[Any]
 def find_bridges(node_count: int, pairs: Array) -> Array:
     """Which edges of a graph, connected or not, are in no cycle.
 
-    Every edge outside a spanning forest gets a random number; a forest edge is a bridge where the numbers of
-    the edges that leave the part below it cancel out, so linear in time.
+    Every edge outside a spanning forest gets a random number; a forest edge is a bridge where the numbers
+    of the edges that leave the part below it cancel out, so linear in time.
 
     Parameters
     ----------

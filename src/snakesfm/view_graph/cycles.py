@@ -104,7 +104,7 @@ def median_of(edge_count: int, cycles: Cycles, alive: Array) -> Array:
 
 
 def _candidates(node_count: int, pairs: Array, sample: int) -> Iterator[Array]:
-    """Keys (T,) int64 of 3-cycles in chunks: row of the edge (i, j) times ``node_count``, plus k, i < j < k."""
+    """Keys (T,) int64 of 3-cycles i < j < k in chunks: row of edge (i, j) times ``node_count``, plus k."""
     if len(pairs) == 0:
         return
     heads, tails = pairs.T

@@ -172,7 +172,9 @@ def test_refused_edges_that_agree_are_taken_back_and_wrong_ones_refused():
     rng = np.random.default_rng(14)
     wrong = (rng.uniform(size=len(pairs)) < 0.25) & (pairs[:, 1] - pairs[:, 0] > 1)
     rotations[wrong] = Rotation.random(int(wrong.sum()), rng).as_matrix()
-    filtered = np.where(wrong ^ (rng.uniform(size=len(pairs)) < 0.1), "cycle_message", "kept").astype(object)
+    filtered = np.where(wrong ^ (rng.uniform(size=len(pairs)) < 0.1), "cycle_message", "kept").astype(
+        object
+    )
     filtered[pairs[:, 1] - pairs[:, 0] == 1] = "kept"
     graph = RotationGraph(40, pairs, rotations, np.ones(len(pairs)), np.full((len(pairs), 3, 3), np.nan))
     averaged, reasons, components = average_view_graph(TwoStageAverager(), graph, filtered, 5.0, 10.0, 2, 0)

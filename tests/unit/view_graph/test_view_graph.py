@@ -90,11 +90,17 @@ def test_cycles_agree_with_brute_force(monkeypatch, chunk):
 
 def test_sampled_cycles_are_real_and_bounded():
     pairs, rotations, _ = noisy_graph(80, 1.0, 2)
-    full, sampled = find_cycles(80, pairs, rotations, per_edge=80), find_cycles(80, pairs, rotations, per_edge=8)
+    full, sampled = (
+        find_cycles(80, pairs, rotations, per_edge=80),
+        find_cycles(80, pairs, rotations, per_edge=8),
+    )
     assert len(full.edges) == 80 * 79 * 78 // 6
     assert 4 * len(pairs) < len(sampled.edges) <= 8 * len(pairs)
     every = {tuple(row): error for row, error in zip(full.edges.tolist(), full.errors, strict=True)}
-    assert all(every[tuple(row)] == error for row, error in zip(sampled.edges.tolist(), sampled.errors, strict=True))
+    assert all(
+        every[tuple(row)] == error
+        for row, error in zip(sampled.edges.tolist(), sampled.errors, strict=True)
+    )
     assert np.bincount(sampled.edges.ravel(), minlength=len(pairs)).min() >= 7
     alive = np.ones(len(pairs), dtype=bool)
     difference = median_of(len(pairs), full, alive) - median_of(len(pairs), sampled, alive)
@@ -109,7 +115,9 @@ def test_bridges_are_what_disconnects(seed):
     pairs = np.unique(np.sort(rng.integers(0, 40, (42, 2)), axis=1), axis=0)
     pairs = pairs[pairs[:, 0] != pairs[:, 1]]
     parts = label_components(40, pairs).max()
-    expected = [label_components(40, np.delete(pairs, row, axis=0)).max() > parts for row in range(len(pairs))]
+    expected = [
+        label_components(40, np.delete(pairs, row, axis=0)).max() > parts for row in range(len(pairs))
+    ]
     assert 0 < sum(expected) < len(pairs)
     np.testing.assert_array_equal(find_bridges(40, pairs), expected)
 
