@@ -15,10 +15,10 @@ CHUNK = 1 << 19
 PER_EDGE = 64
 """Third images that are tried per edge: all of them where one end has no more neighbours."""
 
-FEWEST_PER_EDGE = 16
+FEWEST_PER_EDGE = 8
 """The same in large dense graphs."""
 
-TRIED = 1 << 22
+TRIED = 1 << 20
 """Candidates up to which ``PER_EDGE`` are tried."""
 
 
