@@ -3,6 +3,7 @@
 import importlib
 import json
 import os
+import resource
 import sys
 import time
 import traceback
@@ -65,7 +66,7 @@ def run_job(stage: str) -> None:
     ended = time.time()
     print(
         f"{_clock(ended)} {stage} done in {ended - started:.2f} s, "
-        f"{_processor_seconds() - before:.2f} s of processor time",
+        f"{_processor_seconds() - before:.2f} s of processor time, {_peak_mb():.0f} MB at most",
         flush=True,
     )
 
@@ -74,6 +75,11 @@ def _processor_seconds() -> float:
     """Processor time of this process and of its children that ended."""
     times = os.times()
     return times.user + times.system + times.children_user + times.children_system
+
+
+def _peak_mb() -> float:
+    """Largest memory of this process so far, exact where Snakemake's record of a job is sampled."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 
 def _clock(seconds: float) -> str:

@@ -121,13 +121,16 @@ def observations_of(reconstruction: pycolmap.Reconstruction) -> tuple[Array, Arr
     points3d = reconstruction.points3D
     ids = sorted(points3d)
     positions = np.array([points3d[key].xyz for key in ids], dtype=np.float64).reshape(-1, 3)
-    seen = [
-        (row, element.image_id - 1, element.point2D_idx)
-        for row, key in enumerate(ids)
+    lengths = np.array([points3d[key].track.length() for key in ids], dtype=np.int64)
+    # number by number: a list of all observations would take ten times the memory
+    numbers = (
+        number
+        for key in ids
         for element in points3d[key].track.elements
-    ]
-    flat = np.array(seen, dtype=np.int64).reshape(-1, 3)
-    return positions, flat[:, 0], flat[:, 1], flat[:, 2]
+        for number in (element.image_id, element.point2D_idx)
+    )
+    flat = np.fromiter(numbers, np.int64, 2 * int(lengths.sum())).reshape(-1, 2)
+    return positions, np.repeat(np.arange(len(ids)), lengths), flat[:, 0] - 1, flat[:, 1]
 
 
 def observed_keypoints(reconstruction: pycolmap.Reconstruction, model: BundleModel) -> Array:

@@ -1,5 +1,6 @@
 """Registration of images that averaging left out, by their matches to points of the model."""
 
+from dataclasses import dataclass
 from typing import Any
 
 import cv2  # noqa: F401 - must be loaded before pycolmap, whose PNG library clashes otherwise
@@ -43,8 +44,8 @@ def register_left_out(
     left_out = sorted(set(reconstruction.images) - registered)
     if not left_out:
         return []
-    point_of = _points_of_keypoints(reconstruction)
-    found = {image: _matched_points(graph, image, point_of) for image in left_out}
+    observed = _ObservedKeypoints.of(reconstruction)
+    found = {image: _matched_points(graph, image, observed) for image in left_out}
     done = []
     for image_id in sorted(left_out, key=lambda image: (-len(found[image]), image)):
         if len(found[image_id]) < min_inliers:
@@ -54,38 +55,61 @@ def register_left_out(
     return done
 
 
-def _points_of_keypoints(reconstruction: pycolmap.Reconstruction) -> dict[tuple[int, int], int]:
-    ids = sorted(reconstruction.point3D_ids())
-    _, points, images, rows = observations_of(reconstruction)
-    return {
-        (image + 1, row): ids[point]
-        for point, image, row in zip(points.tolist(), images.tolist(), rows.tolist(), strict=True)
-    }
+@dataclass(frozen=True)
+class _ObservedKeypoints:
+    """Which keypoints observe a point.
+
+    Parameters
+    ----------
+    images : ids of the images that observe any.
+    keys : (L,) int64, ascending, image id times ``factor`` plus keypoint.
+    factor : larger than any keypoint.
+    points : (L,) int64, id of the point.
+    """
+
+    images: list[int]
+    keys: Array
+    factor: int
+    points: Array
+
+    @classmethod
+    def of(cls, reconstruction: pycolmap.Reconstruction) -> "_ObservedKeypoints":
+        ids = np.array(sorted(reconstruction.point3D_ids()), dtype=np.int64)
+        _, points, images, rows = observations_of(reconstruction)
+        factor = int(rows.max(initial=0)) + 1
+        keys = (images + 1) * factor + rows
+        order = np.argsort(keys)
+        return cls((np.unique(images) + 1).tolist(), keys[order], factor, ids[points[order]])
+
+    def look_up(self, image_id: int, rows: Array) -> tuple[Array, Array]:
+        """Which keypoints (K,) of an image observe a point, (K,) bool, and the points of those that do."""
+        keys = image_id * self.factor + np.minimum(rows, self.factor - 1)
+        at = np.minimum(np.searchsorted(self.keys, keys), len(self.keys) - 1)
+        there = (self.keys[at] == keys) & (rows < self.factor)
+        return there, self.points[at[there]]
 
 
 def _matched_points(
-    graph: pycolmap.CorrespondenceGraph, image_id: int, point_of: dict[tuple[int, int], int]
+    graph: pycolmap.CorrespondenceGraph, image_id: int, observed: _ObservedKeypoints
 ) -> Array:
     """Rows (keypoint, point id, votes): for each keypoint the point that most of its matches observe."""
-    votes: dict[tuple[int, int], int] = {}
-    for other in sorted({image for image, _ in point_of}):
+    parts = [np.zeros((0, 2), dtype=np.int64)]
+    for other in observed.images:
+        if graph.num_matches_between_images(image_id, other) == 0:
+            continue
         matches = graph.extract_matches_between_images(image_id, other)
-        for mine, theirs in np.asarray(matches).reshape(-1, 2).tolist():
-            point = point_of.get((other, theirs))
-            if point is not None:
-                votes[mine, point] = votes.get((mine, point), 0) + 1
-    ranked = sorted((mine, -count, point) for (mine, point), count in votes.items())
-    best: dict[int, tuple[int, int]] = {}
-    for mine, count, point in ranked:
-        best.setdefault(mine, (point, -count))
-    # a point is seen once by an image: the keypoint with most votes keeps it
-    owners: dict[int, tuple[int, int]] = {}
-    for mine, (point, count) in best.items():
-        if point not in owners or count > owners[point][1]:
-            owners[point] = (mine, count)
-    return np.array(
-        sorted((mine, point, count) for point, (mine, count) in owners.items()), dtype=np.int64
-    ).reshape(-1, 3)
+        mine, theirs = np.asarray(matches, dtype=np.int64).reshape(-1, 2).T
+        there, points = observed.look_up(other, theirs)
+        parts.append(np.stack([mine[there], points], axis=1))
+    votes, counts = np.unique(np.concatenate(parts), axis=0, return_counts=True)
+    table = np.column_stack([votes, counts]).astype(np.int64)
+    # of each keypoint the point with most votes; then, as an image sees a point once, of each point the
+    # keypoint with most votes
+    for column in (0, 1):
+        order = np.lexsort((table[:, 1 - column], -table[:, 2], table[:, column]))
+        first = np.unique(table[order, column], return_index=True)[1]
+        table = table[order[first]]
+    return np.asarray(table[np.argsort(table[:, 0])])
 
 
 def _register(

@@ -11,6 +11,8 @@ from snakesfm.geometry.rotations import angle_between
 
 Array = NDArray[Any]
 FAILED_DEG = 180.0
+# all pairs of 2,000 images; of more images as many pairs are drawn
+MOST_PAIRS = 4_000_000
 COINCIDENT_RATIO = 1e-9
 
 
@@ -39,6 +41,17 @@ def pose_auc(errors_deg: Array, thresholds_deg: Sequence[float]) -> list[float]:
     return areas
 
 
+def compared_images(count: int, most_pairs: int = MOST_PAIRS) -> Array:
+    """The images (n,k) that each of n images is compared with, ascending; a pair is ordered.
+
+    All others, or of many images so many that there are no more than about ``most_pairs`` pairs: the same
+    steps through the list of images, drawn once, lead from every image to its partners.
+    """
+    partners = max(min(count - 1, most_pairs // max(count, 1)), 0)
+    steps = np.random.default_rng(count).choice(max(count - 1, 0), partners, replace=False) + 1
+    return np.sort((np.arange(count)[:, None] + steps) % max(count, 1), axis=1)
+
+
 def relative_pose_errors(
     rotations: Array,
     translations: Array,
@@ -46,7 +59,9 @@ def relative_pose_errors(
     reference_translations: Array,
     min_baseline: float = 0.0,
 ) -> tuple[Array, Array]:
-    """Rotation and translation-direction errors of the relative poses of all ordered pairs.
+    """Rotation and translation-direction errors of the relative poses of ordered pairs.
+
+    The pairs are those of :func:`compared_images`: all, or a sample of so many that memory is bounded.
 
     Parameters
     ----------
@@ -56,7 +71,7 @@ def relative_pose_errors(
 
     Returns
     -------
-    rotation_deg, direction_deg : (n (n-1),) float64; 180 where an image is not registered; the direction's
+    rotation_deg, direction_deg : (n k,) float64; 180 where an image is not registered; the direction's
         error is 0 where the reference has none and 180 where only the model has none.
     """
     count = len(reference_rotations)
@@ -69,10 +84,11 @@ def relative_pose_errors(
     coincident = COINCIDENT_RATIO * float(np.linalg.norm(np.ptp(centers, axis=0))) if count else 0.0
     # |R_j R_i^T - R*_j R*_i^T| is |D_j - D_i| with D = R*^T R, so no pair needs a product.
     differences = np.swapaxes(reference_rotations, 1, 2) @ model_rotations
-    rotation_deg = np.zeros((count, max(count - 1, 0)))
+    compared = compared_images(count)
+    rotation_deg = np.zeros(compared.shape)
     direction_deg = np.zeros_like(rotation_deg)
     for j in range(count):
-        others = np.delete(np.arange(count), j)
+        others = compared[j]
         rotation_deg[j] = chordal_angle_deg(differences[others], differences[j])
         reference_direction = (reference_centers[others] - reference_centers[j]) @ reference_rotations[j].T
         direction = (centers[others] - centers[j]) @ model_rotations[j].T

@@ -27,9 +27,14 @@ def run(job: StageJob) -> None:
     pairs_file = str(job.settings["pairs_file"])
     options: SelectPairsOptions = job.options
     table = _choose(job, index, options, pairs_file)
-    blocks = np.sort(index.blocks[table.pairs], axis=1)
-    for tile in itertools.combinations_with_replacement(range(int(job.settings["blocks"])), 2):
-        part = table.take(np.flatnonzero((blocks == tile).all(axis=1)))
+    blocks = int(job.settings["blocks"])
+    tiles = np.sort(index.blocks[table.pairs].astype(np.int64), axis=1) @ [blocks, 1]
+    order = np.argsort(tiles, kind="stable")
+    tiles = tiles[order]
+    for tile in itertools.combinations_with_replacement(range(blocks), 2):
+        number = tile[0] * blocks + tile[1]
+        first, last = np.searchsorted(tiles, [number, number + 1])
+        part = table.take(order[first:last])
         ImagePairs(
             pairs=part.pairs,
             reasons=np.array(part.reason_texts(), dtype=object),

@@ -1,0 +1,109 @@
+"""One simulated scene through the workflow, and what its jobs needed."""
+
+import json
+import re
+import shutil
+import subprocess
+import sys
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+
+import yaml
+
+from snakesfm.simulate import Simulation, SimulationOptions
+
+ROOT = Path(__file__).resolve().parents[2]
+DONE = re.compile(
+    r"^\S+ (\w+) done in ([\d.]+) s, ([\d.]+) s of processor time, (\d+) MB at most$", re.MULTILINE
+)
+PAIRS = re.compile(r"^(\d+) pairs", re.MULTILINE)
+ACCURACY = ("relative_pose_auc_1deg", "relative_pose_auc_5deg", "position_error_percent_median")
+
+
+@dataclass
+class StageNeed:
+    """What the jobs of one stage needed."""
+
+    jobs: int = 0
+    seconds: float = 0.0
+    """Of all jobs, by the clock; not to be trusted on a machine that does other things too."""
+    cpu: float = 0.0
+    """Of all jobs, seconds of processor."""
+    most_cpu: float = 0.0
+    """Of the longest job."""
+    most_mb: float = 0.0
+    """Largest memory of a job."""
+
+
+@dataclass
+class Measurement:
+    """One run."""
+
+    survey: str
+    images: int
+    blocks: int
+    first: str
+    """The last stage whose artifacts were simulated; the workflow ran from there."""
+    pairs: int = 0
+    registered: int = 0
+    accuracy: dict[str, float] = field(default_factory=dict)
+    stages: dict[str, StageNeed] = field(default_factory=dict)
+
+
+def measure(options: SimulationOptions, folder: Path, cores: int, last: str) -> Measurement:
+    """Simulate a scene where it is not there yet, run the workflow to the stage ``last``, and read its logs."""
+    if not (folder / "config.yaml").is_file():
+        shutil.rmtree(folder, ignore_errors=True)
+        Simulation(folder, options).run()
+    command = [sys.executable, "-m", "snakemake", "--snakefile", str(ROOT / "Snakefile"), "--quiet", "all"]
+    command += ["--profile", str(ROOT / "profiles" / "local"), "--cores", str(cores)]
+    command += ["--configfile", str((folder / "config.yaml").resolve())]
+    if last:
+        command += ["--until", last]
+    subprocess.run(command, cwd=folder, check=True, stdout=subprocess.DEVNULL)
+    return collect(options, folder)
+
+
+def collect(options: SimulationOptions, folder: Path) -> Measurement:
+    """What the logs and the metrics of a scene say."""
+    config = yaml.safe_load((folder / "config.yaml").read_text("utf-8"))
+    scene = folder / "results" / config["scene"]
+    result = Measurement(options.survey, options.images, int(config["blocks"]), options.until)
+    for log in sorted(scene.glob("logs/*/*.log")):
+        found = DONE.findall(log.read_text("utf-8"))
+        if not found:
+            continue
+        stage, seconds, cpu, mb = found[-1]
+        need = result.stages.setdefault(stage, StageNeed())
+        need.jobs += 1
+        need.seconds += float(seconds)
+        need.cpu += float(cpu)
+        need.most_cpu = max(need.most_cpu, float(cpu))
+        need.most_mb = max(need.most_mb, float(mb))
+    pairs = [folder / "pairs.txt"]
+    if pairs[0].is_file():
+        result.pairs = len(pairs[0].read_text("utf-8").splitlines())
+    else:
+        text = (scene / "logs" / "select_pairs" / "job.log").read_text("utf-8")
+        result.pairs = int(PAIRS.findall(text)[-1])
+    metrics = scene / "evaluate_model" / "metrics.json"
+    if metrics.is_file():
+        content = json.loads(metrics.read_text("utf-8"))
+        result.registered = int(content["registered_images"])
+        result.accuracy = {name: float(content[name]) for name in ACCURACY}
+    return result
+
+
+def save(measurements: list[Measurement], path: Path) -> None:
+    """Write measurements as JSON."""
+    path.write_text(json.dumps([asdict(m) for m in measurements], indent=1) + "\n", "utf-8")
+
+
+def load(path: Path) -> list[Measurement]:
+    """Measurements that were saved; none where there is no file."""
+    if not path.is_file():
+        return []
+    rows = json.loads(path.read_text("utf-8"))
+    for row in rows:
+        row["stages"] = {stage: StageNeed(**need) for stage, need in row["stages"].items()}
+    return [Measurement(**row) for row in rows]
