@@ -29,17 +29,22 @@ def main() -> None:
     )
     parser.add_argument("--images", type=int, nargs="*", default=[], help="numbers of images")
     parser.add_argument("--survey", choices=sorted(SURVEYS), default="aerial")
-    parser.add_argument("--until", choices=UNTIL, default="extract_features", help="last stage that is simulated")
+    parser.add_argument(
+        "--until", choices=UNTIL, default="extract_features", help="last stage that is simulated"
+    )
     parser.add_argument("--last", choices=STAGES, default=None, help="stage after which the workflow stops")
+    parser.add_argument("--tiles", type=int, default=0, help="match so many tiles only, and stop")
     parser.add_argument("--cores", type=int, default=os.cpu_count() or 1)
-    parser.add_argument("--folder", type=Path, help="where the scenes go and stay; a temporary folder otherwise")
+    parser.add_argument(
+        "--folder", type=Path, help="where the scenes go and stay; a temporary folder otherwise"
+    )
     given = parser.parse_args()
     measurements = load(RECORDS)
     with tempfile.TemporaryDirectory() as name:
         for images in given.images:
             options = SimulationOptions(images, given.survey, given.until)
             folder = (given.folder or Path(name)) / f"{given.survey}_{images}_{given.until}"
-            found = measure(options, folder, given.cores, given.last or "")
+            found = measure(options, folder, given.cores, given.last or "", given.tiles)
             key = (found.survey, found.images, found.first)
             measurements = [m for m in measurements if (m.survey, m.images, m.first) != key]
             measurements = sorted([*measurements, found], key=lambda m: (m.survey, m.images, m.first))

@@ -8,8 +8,10 @@ import sys
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
+import h5py
 import yaml
 
+from snakesfm.plan import choose_blocks
 from snakesfm.simulate import Simulation, SimulationOptions
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -17,6 +19,7 @@ DONE = re.compile(
     r"^\S+ (\w+) done in ([\d.]+) s, ([\d.]+) s of processor time, (\d+) MB at most$", re.MULTILINE
 )
 PAIRS = re.compile(r"^(\d+) pairs", re.MULTILINE)
+TILED = ("match_pairs", "estimate_two_view")
 ACCURACY = ("relative_pose_auc_1deg", "relative_pose_auc_5deg", "position_error_percent_median")
 
 
@@ -33,6 +36,8 @@ class StageNeed:
     """Of the longest job."""
     most_mb: float = 0.0
     """Largest memory of a job."""
+    pairs: int = 0
+    """Pairs of all jobs, of stages that work on tiles."""
 
 
 @dataclass
@@ -50,16 +55,31 @@ class Measurement:
     stages: dict[str, StageNeed] = field(default_factory=dict)
 
 
-def measure(options: SimulationOptions, folder: Path, cores: int, last: str) -> Measurement:
-    """Simulate a scene where it is not there yet, run the workflow to the stage ``last``, and read its logs."""
+def measure(
+    options: SimulationOptions, folder: Path, cores: int, last: str = "", tiles: int = 0
+) -> Measurement:
+    """Simulate a scene where it is not there yet, run the workflow, and read its logs.
+
+    Parameters
+    ----------
+    cores : for Snakemake.
+    last : stage after which the workflow stops, "" for none.
+    tiles : so many tiles are matched and no more is done; 0 for all.
+    """
     if not (folder / "config.yaml").is_file():
         shutil.rmtree(folder, ignore_errors=True)
         Simulation(folder, options).run()
-    command = [sys.executable, "-m", "snakemake", "--snakefile", str(ROOT / "Snakefile"), "--quiet", "all"]
+    command = [sys.executable, "-m", "snakemake", "--snakefile", str(ROOT / "Snakefile"), "--quiet"]
     command += ["--profile", str(ROOT / "profiles" / "local"), "--cores", str(cores)]
     command += ["--configfile", str((folder / "config.yaml").resolve())]
     if last:
         command += ["--until", last]
+    if tiles:
+        blocks = options.blocks or choose_blocks(options.images)
+        # off the diagonal, where two blocks are read
+        names = [f"{k % blocks}-{(k + blocks // 2) % blocks}" for k in range(min(tiles, blocks // 2))]
+        scene = folder.resolve() / "results" / folder.name
+        command += [str(scene / "estimate_two_view" / f"{name}.h5") for name in names]
     subprocess.run(command, cwd=folder, check=True, stdout=subprocess.DEVNULL)
     return collect(options, folder)
 
@@ -75,6 +95,10 @@ def collect(options: SimulationOptions, folder: Path) -> Measurement:
             continue
         stage, seconds, cpu, mb = found[-1]
         need = result.stages.setdefault(stage, StageNeed())
+        artifact = scene / stage / f"{log.stem}.h5"
+        if stage in TILED and artifact.is_file():
+            with h5py.File(artifact) as file:
+                need.pairs += len(file["pairs"])
         need.jobs += 1
         need.seconds += float(seconds)
         need.cpu += float(cpu)
@@ -83,7 +107,7 @@ def collect(options: SimulationOptions, folder: Path) -> Measurement:
     pairs = [folder / "pairs.txt"]
     if pairs[0].is_file():
         result.pairs = len(pairs[0].read_text("utf-8").splitlines())
-    else:
+    elif (scene / "logs" / "select_pairs" / "job.log").is_file():
         text = (scene / "logs" / "select_pairs" / "job.log").read_text("utf-8")
         result.pairs = int(PAIRS.findall(text)[-1])
     metrics = scene / "evaluate_model" / "metrics.json"

@@ -7,7 +7,7 @@ MARGIN = 2.0
 
 @dataclass(frozen=True)
 class Need:
-    """Model of one stage's jobs: ``fixed + per_image * N + per_block_image * n + per_pair * P + per_tile_pair * t``.
+    """Model of one stage's jobs: a constant, and coefficients of N, n, P and t.
 
     N images, n images per block, P pairs, t pairs per tile.
 

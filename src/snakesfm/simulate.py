@@ -295,6 +295,8 @@ class Simulation:
             "reference": str(self.folder / "reference"),
             "blocks": self.blocks,
         }
+        # the same choice at all sizes: 'auto' would take all pairs of few images
+        content["select_pairs"] = {"method": "sequential+retrieval"}
         if listed:
             content |= {"pairs": str(self.folder / "pairs.txt"), "select_pairs": {"method": "listed"}}
         with atomic_path(self.folder / "config.yaml") as temporary:

@@ -11,6 +11,12 @@ from snakesfm.translation_averaging.problem import PositioningProblem
 
 Array = NDArray[Any]
 
+DIRECT_CAMERAS = 1000
+"""Cameras up to which the reduced system is factored; the factor of a larger one grows faster than it."""
+
+CG_TOLERANCE = 1e-4
+CG_ITERATIONS = 1500
+
 
 @dataclass(frozen=True)
 class _Linearized:
@@ -158,7 +164,6 @@ def _step(
 ) -> tuple[Array, Array]:
     """Damped Gauss-Newton steps of the cameras (n,3) and of the landmarks (m,3)."""
     from scipy.sparse import coo_matrix
-    from scipy.sparse.linalg import splu
 
     cameras, landmarks = int(ends.max(initial=-1)) + 1, int(track_row.max(initial=-1)) + 1
     cameras = max(cameras, int(ray_column.max(initial=-1)) + 1)
@@ -199,8 +204,39 @@ def _step(
     rows = np.broadcast_to(3 * row[:, None, None] + np.arange(3)[:, None], shape)
     columns = np.broadcast_to(3 * column[:, None, None] + np.arange(3), shape)
     matrix = coo_matrix((blocks.ravel(), (rows.ravel(), columns.ravel())), shape=(3 * cameras,) * 2).tocsc()
-    step = splu(matrix, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True}, diag_pivot_thresh=0.0)
-    delta = step.solve(reduced_g.ravel()).reshape(-1, 3)
+    delta = solve_blocks(matrix, reduced_g)
     pull = sum_by(np.einsum("qij,qj->qi", ray_h, delta[ray_column]), track_row, landmarks)
     move = np.einsum("pij,pj->pi", inverse, point_g + pull)
     return delta, move
+
+
+def solve_blocks(matrix: Any, right: Array, direct_up_to: int = DIRECT_CAMERAS) -> Array:
+    """Solution (n,3) of a sparse symmetric positive definite system of 3x3 blocks.
+
+    By a sparse factor, or for more than ``direct_up_to`` blocks by conjugate gradients with the inverse
+    diagonal blocks as preconditioner, whose memory and time per iteration are those of the matrix. Where
+    these do not converge, by the factor after all.
+
+    Parameters
+    ----------
+    matrix : (3n,3n) sparse.
+    right : (n,3).
+    """
+    from scipy.sparse import bsr_matrix
+    from scipy.sparse.linalg import cg, splu
+
+    if len(right) > direct_up_to:
+        blocks = matrix.tobsr((3, 3))
+        block_row = np.repeat(np.arange(len(right)), np.diff(blocks.indptr))
+        inverse = np.linalg.inv(blocks.data[blocks.indices == block_row])
+        places = np.arange(len(right) + 1)
+        preconditioner = bsr_matrix((inverse, places[:-1], places), shape=matrix.shape)
+        solution, failed = cg(
+            blocks, right.ravel(), rtol=CG_TOLERANCE, maxiter=CG_ITERATIONS, M=preconditioner
+        )
+        if not failed:
+            return np.asarray(solution.reshape(-1, 3))
+    factor = splu(
+        matrix, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True}, diag_pivot_thresh=0.0
+    )
+    return np.asarray(factor.solve(right.ravel()).reshape(-1, 3))
