@@ -1,6 +1,6 @@
 """Options of average_translations."""
 
-from typing import Literal
+from typing import ClassVar, Literal
 
 from pydantic import Field
 
@@ -9,6 +9,8 @@ from snakesfm.config.base import StageOptions
 
 class AverageTranslationsOptions(StageOptions):
     """Options of positioning the cameras, their rotations being known."""
+
+    stage_version: ClassVar[int] = 2
 
     method: Literal["scale_chain", "translation_recovery", "global_positioning"] = "scale_chain"
     """First guess: baselines compared by landmarks, gtsam's recovery, or pycolmap's global positioning."""

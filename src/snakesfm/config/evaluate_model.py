@@ -1,5 +1,7 @@
 """Options of evaluate_model."""
 
+from typing import ClassVar
+
 from pydantic import Field
 
 from snakesfm.config.base import StageOptions
@@ -7,6 +9,8 @@ from snakesfm.config.base import StageOptions
 
 class EvaluateModelOptions(StageOptions):
     """Which thresholds the metrics use."""
+
+    stage_version: ClassVar[int] = 2
 
     relative_thresholds_deg: tuple[float, ...] = Field((1.0, 3.0, 5.0, 10.0, 20.0), min_length=1)
     """Thresholds of the AUC over the relative poses of all pairs of reference images, in degrees."""

@@ -11,7 +11,12 @@ from snakesfm.evaluation.__main__ import main
 from snakesfm.evaluation.alignment import align_poses
 from snakesfm.evaluation.colmap_model import find_model, model_poses, read_model
 from snakesfm.evaluation.metrics import Poses, evaluate_poses, match_names, model_metrics
-from snakesfm.evaluation.pose_errors import chordal_angle_deg, pose_auc, relative_pose_errors
+from snakesfm.evaluation.pose_errors import (
+    chordal_angle_deg,
+    compared_images,
+    pose_auc,
+    relative_pose_errors,
+)
 from snakesfm.geometry.poses import center_of, translation_of
 from snakesfm.geometry.rotations import angle_of, exp_so3
 from snakesfm.synthetic.problems import make_problem
@@ -87,6 +92,18 @@ def test_relative_errors_equal_those_computed_pair_by_pair() -> None:
             expected.append((np.degrees(angle_of(relative @ reference.T)), np.degrees(np.arccos(cosine))))
     assert rotation_deg == pytest.approx([pair[0] for pair in expected])
     assert direction_deg == pytest.approx([pair[1] for pair in expected])
+
+
+def test_of_many_images_every_one_is_compared_with_equally_many_others() -> None:
+    all_others = compared_images(7)
+    assert all_others.tolist() == [[i for i in range(7) if i != j] for j in range(7)]
+    few = compared_images(50, most_pairs=500)
+    assert few.shape == (50, 10)
+    assert (np.diff(few, axis=1) > 0).all()
+    assert (few != np.arange(50)[:, None]).all()
+    assert (np.bincount(few.ravel(), minlength=50) == 10).all()
+    assert compared_images(1).shape == (1, 0)
+    assert compared_images(0).shape == (0, 0)
 
 
 def test_equal_centres_have_no_direction_in_the_reference_and_fail_in_the_model_only() -> None:
