@@ -33,7 +33,7 @@ MAP = (
     "adjust_bundle",
 )
 STARTED = re.compile(r"^(\d{4}-\d\d-\d\dT\S+) (\w+) (?!done in )", re.M)
-ENDED = re.compile(r"^(\d{4}-\d\d-\d\dT\S+) (\w+) done in [\d.]+ s, ([\d.]+) s of processor time$", re.M)
+ENDED = re.compile(r"^(\d{4}-\d\d-\d\dT\S+) (\w+) done in [\d.]+ s, ([\d.]+) s of processor time", re.M)
 
 
 def snakesfm(
