@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 
 Array = NDArray[Any]
 
+HELD_BYTES = 1 << 29
+
 REASONS = ("exhaustive", "sequential", "retrieved", "listed")
 
 
@@ -84,12 +86,17 @@ def sequential_pairs(names: Sequence[str], look_ahead: int) -> PairTable:
 
 
 def similar_pairs(
-    blocks: Sequence[Array], read_block: Callable[[int], Array], top_k: int, min_score: float
+    blocks: Sequence[Array],
+    read_block: Callable[[int], Array],
+    top_k: int,
+    min_score: float,
+    held_bytes: int = HELD_BYTES,
 ) -> PairTable:
     """Every image with the ``top_k`` images that resemble it most.
 
-    The similarity matrix is computed block by block; no more than two blocks of descriptors and one block
-    of similarities are held at a time, and ``top_k`` candidates per image.
+    The similarity matrix is computed block by block. Some blocks of descriptors are held while all blocks
+    pass by once, so that few are read again; beside them one block and its similarities are in memory, and
+    ``top_k`` candidates per image.
 
     Parameters
     ----------
@@ -97,24 +104,40 @@ def similar_pairs(
     read_block : gives the descriptors (n_a,D) float32 of a block, of unit length or zero.
     top_k : most partners that an image chooses; it may be chosen by more. Ties go to the smaller row.
     min_score : least similarity, a dot product; images without features (similarity 0) are never paired.
+    held_bytes : blocks are held until their descriptors take so much memory; at least one is.
     """
     found: list[Array] = []
     scores: list[Array] = []
-    for rows in range(len(blocks)):
-        own = read_block(rows)
-        best_ids = np.full((len(own), 0), -1)
-        best = np.full((len(own), 0), np.float32(0))
-        for columns in range(len(blocks)):
-            other = own if columns == rows else read_block(columns)
-            similarity = own @ other.T
-            if columns == rows:
-                np.fill_diagonal(similarity, -np.inf)
-            ids = np.concatenate([best_ids, np.broadcast_to(blocks[columns], similarity.shape)], axis=1)
-            both = np.concatenate([best, similarity], axis=1)
-            order = np.lexsort((ids, -both), axis=1)[:, :top_k]
-            best_ids, best = np.take_along_axis(ids, order, 1), np.take_along_axis(both, order, 1)
-        image, slot = np.nonzero((best >= min_score) & (best > 0))
-        found.append(np.column_stack([blocks[rows][image], best_ids[image, slot]]))
-        scores.append(best[image, slot])
+    first = 0
+    while first < len(blocks):
+        held = {first: read_block(first)}
+        while first + len(held) < len(blocks) and sum(own.nbytes for own in held.values()) < held_bytes:
+            held[first + len(held)] = read_block(first + len(held))
+        first += len(held)
+        best = {
+            row: (np.full((len(own), 0), -1), np.zeros((len(own), 0), np.float32))
+            for row, own in held.items()
+        }
+        for column in range(len(blocks)):
+            other = held[column] if column in held else read_block(column)
+            for row, own in held.items():
+                similarity = own @ other.T
+                if column == row:
+                    np.fill_diagonal(similarity, -np.inf)
+                best[row] = _largest(*best[row], blocks[column], similarity, top_k)
+        for row, (ids, similarities) in best.items():
+            image, slot = np.nonzero((similarities >= min_score) & (similarities > 0))
+            found.append(np.column_stack([blocks[row][image], ids[image, slot]]))
+            scores.append(similarities[image, slot])
     pairs = np.concatenate(found) if found else np.zeros((0, 2))
     return PairTable.of(pairs, "retrieved", np.concatenate(scores) if scores else None)
+
+
+def _largest(
+    ids: Array, similarities: Array, more_ids: Array, more: Array, top_k: int
+) -> tuple[Array, Array]:
+    """The ``top_k`` largest of each row and their ids, of those found before and of one more block."""
+    ids = np.concatenate([ids, np.broadcast_to(more_ids, more.shape)], axis=1)
+    both = np.concatenate([similarities, more], axis=1)
+    order = np.lexsort((ids, -both), axis=1)[:, :top_k]
+    return np.take_along_axis(ids, order, 1), np.take_along_axis(both, order, 1)

@@ -65,6 +65,26 @@ def test_similar_pairs_do_not_depend_on_the_blocks(block_count):
     np.testing.assert_array_equal(table.similarities, similarity[tuple(table.pairs.T)])
 
 
+def test_blocks_that_are_held_are_not_read_again_and_change_nothing():
+    vectors = unit_vectors(40)
+    blocks = [np.arange(start, start + 8) for start in range(0, 40, 8)]
+    counts, tables = [], []
+    # one block at a time, two, and all
+    for held_bytes in (0, 2 * vectors[:8].nbytes, 1 << 30):
+        reads = []
+
+        def read(block, reads=reads):
+            reads.append(block)
+            return vectors[blocks[block]]
+
+        tables.append(similar_pairs(blocks, read, 3, 0.0, held_bytes))
+        counts.append(len(reads))
+    assert counts == [25, 15, 5]
+    for table in tables[1:]:
+        np.testing.assert_array_equal(table.pairs, tables[0].pairs)
+        np.testing.assert_array_equal(table.similarities, tables[0].similarities)
+
+
 def test_images_without_features_resemble_none():
     vectors = unit_vectors(6)
     vectors[2] = 0
