@@ -50,6 +50,7 @@ class SimulationOptions:
     survey : ``aerial`` or ``street``, see :mod:`snakesfm.synthetic.surveys`.
     until : the last stage whose artifacts are made; descriptors are left out from ``match_pairs`` on.
     partners : how many images that see the same an image chooses; about 1.6 times as many result.
+    keypoints : most keypoints of an image, the strongest.
     known_focal : whether the cameras' intrinsics are given.
     blocks : number of blocks, 0 for what the workflow would choose.
     seed : of everything random.
@@ -59,6 +60,7 @@ class SimulationOptions:
     survey: str = "aerial"
     until: str = "select_pairs"
     partners: int = 15
+    keypoints: int = 5000
     known_focal: bool = True
     blocks: int = 0
     seed: int = 0
@@ -82,7 +84,7 @@ class Simulation:
         self.options = options
         self.scene = self.folder.name
         self.survey: Survey = SURVEYS[options.survey](options.images, options.seed)
-        self.model = DetectorModel()
+        self.model = DetectorModel(max_keypoints=options.keypoints)
         self.blocks = options.blocks or choose_blocks(options.images)
         self.block_of = np.array([block_of(name, self.blocks) for name in self.survey.names])
 
@@ -364,6 +366,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument(
         "--partners", type=int, default=default.partners, help="near images that an image chooses"
     )
+    parser.add_argument("--keypoints", type=int, default=default.keypoints, help="most of an image")
     parser.add_argument(
         "--unknown-focal", action="store_true", help="leave the focal length to the workflow"
     )
@@ -377,6 +380,7 @@ def main(arguments: list[str] | None = None) -> int:
         given.survey,
         given.until,
         given.partners,
+        given.keypoints,
         not given.unknown_focal,
         given.blocks,
         given.seed,

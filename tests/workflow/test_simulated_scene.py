@@ -15,7 +15,7 @@ def test_the_workflow_goes_on_from_simulated_matches_to_an_accurate_model(
     workflow: Workflow, tmp_path: Path
 ) -> None:
     folder = tmp_path / "field"
-    options = SimulationOptions(images=60, until="match_pairs", partners=6, blocks=2)
+    options = SimulationOptions(images=60, until="match_pairs", partners=6, keypoints=1200, blocks=2)
     Simulation(folder, options).run()
     outcome = workflow.run("--configfile", str(folder / "config.yaml"))
     assert outcome.status == 0, outcome.text
