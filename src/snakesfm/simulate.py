@@ -27,13 +27,13 @@ from snakesfm.geometry.poses import translation_of
 from snakesfm.plan import choose_blocks, tile_names
 from snakesfm.seeding import block_of, derive_seed
 from snakesfm.synthetic.pairing import candidate_pairs, choose_partners, simulate_edge
-from snakesfm.synthetic.sightings import DetectorModel, match_appearances, sight
+from snakesfm.synthetic.sightings import DetectorModel, DistinctLooks, match_looks, sight
 from snakesfm.synthetic.surveys import SURVEYS, Survey
 
 Array = NDArray[Any]
 
-# per image the landmark ids and the appearances of its keypoints
-Truths = dict[int, tuple[Array, Array]]
+# per image the landmark ids of its keypoints, and those keypoints that can be matched
+Truths = dict[int, tuple[Array, DistinctLooks]]
 
 UNTIL = ("extract_features", "select_pairs", "match_pairs", "estimate_two_view")
 LEAST_IMAGES = {"aerial": 2, "street": 320}
@@ -193,12 +193,15 @@ class Simulation:
         ).write(self._path("extract_features", str(block)), self._header("extract_features"))
         path = self.folder / "truth" / f"{block}.npz"
         path.parent.mkdir(exist_ok=True)
+        distinct = [DistinctLooks.of(s.appearance) for s in sightings]
         np.savez(
             path,
             image_ids=images,
             offsets=offsets,
             landmarks=_join([s.landmarks for s in sightings], (0,), "int64"),
-            appearance=_join([s.appearance for s in sightings], (0,), "uint64"),
+            distinct=np.r_[0, np.cumsum([len(d.looks) for d in distinct])].astype(np.int64),
+            looks=_join([d.looks for d in distinct], (0,), "uint64"),
+            rows=_join([d.rows for d in distinct], (0,), "int64"),
         )
 
     def choose_pairs(self) -> Array:
@@ -322,18 +325,17 @@ class Simulation:
         return np.random.default_rng(derive_seed(self.options.seed, "simulate", what, str(i), str(j)))
 
     def _matches(self, truths: Truths, i: int, j: int) -> Array:
-        return match_appearances(truths[i][1], truths[j][1], RECALL, self._rng("matches", i, j))
+        return match_looks(truths[i][1], truths[j][1], RECALL, self._rng("matches", i, j))
 
     def _truths(self, tile: str) -> Truths:
         """What the keypoints of the tile's one or two blocks show."""
         truths: Truths = {}
         for block in sorted(set(tile.split("-"))):
             with np.load(self.folder / "truth" / f"{block}.npz") as file:
-                parts = [
-                    np.split(file[name], file["offsets"][1:-1]) for name in ("landmarks", "appearance")
-                ]
-                if len(file["image_ids"]):
-                    truths |= dict(zip(file["image_ids"].tolist(), zip(*parts, strict=True), strict=True))
+                shown = np.split(file["landmarks"], file["offsets"][1:-1])
+                looks, rows = (np.split(file[name], file["distinct"][1:-1]) for name in ("looks", "rows"))
+                for row, image in enumerate(file["image_ids"].tolist()):
+                    truths[image] = shown[row], DistinctLooks(looks[row], rows[row])
         return truths
 
     def _rows_of_tiles(self, pairs: Array) -> Iterator[tuple[str, Array]]:

@@ -107,24 +107,45 @@ def sight(
     )
 
 
-def match_appearances(first: Array, second: Array, recall: float, rng: np.random.Generator) -> Array:
-    """Rows (M,2) int32 that mutual nearest neighbours and a ratio test would match, ascending in ``first``.
-
-    What looks alike in both images is matched, right or wrong, unless something else in one of them looks
-    the same: then the ratio test refuses it.
+@dataclass(frozen=True)
+class DistinctLooks:
+    """Keypoints of an image that no other of its keypoints looks like: the ratio test refuses the rest.
 
     Parameters
     ----------
-    first, second : (K,) uint64 appearances of the images' keypoints.
+    looks : (U,) uint64 appearances, ascending.
+    rows : (U,) the keypoint of each.
+    """
+
+    looks: Array
+    rows: Array
+
+    @classmethod
+    def of(cls, appearance: Array) -> "DistinctLooks":
+        """Those of an image's keypoints with appearances (K,) uint64."""
+        looks, rows, counts = np.unique(appearance, return_index=True, return_counts=True)
+        return cls(looks[counts == 1], rows[counts == 1])
+
+
+def match_looks(
+    first: DistinctLooks, second: DistinctLooks, recall: float, rng: np.random.Generator
+) -> Array:
+    """Rows (M,2) int32 that mutual nearest neighbours and a ratio test would match, ascending in ``first``.
+
+    What looks alike in both images is matched, right or wrong.
+
+    Parameters
+    ----------
+    first, second : of the two images.
     recall : share of such pairs that the noise of the descriptors leaves.
     rng : decides which.
     """
-    left, left_rows, left_counts = np.unique(first, return_index=True, return_counts=True)
-    right, right_rows, right_counts = np.unique(second, return_index=True, return_counts=True)
-    _, a, b = np.intersect1d(left, right, assume_unique=True, return_indices=True)
-    single = (left_counts[a] == 1) & (right_counts[b] == 1)
-    matches = np.stack([left_rows[a[single]], right_rows[b[single]]], axis=1)
-    matches = matches[rng.random(len(matches)) < recall]
+    if len(second.looks) == 0:
+        return np.zeros((0, 2), np.int32)
+    at = np.minimum(np.searchsorted(second.looks, first.looks), len(second.looks) - 1)
+    alike = np.flatnonzero(second.looks[at] == first.looks)
+    alike = alike[rng.random(len(alike)) < recall]
+    matches = np.stack([first.rows[alike], second.rows[at[alike]]], axis=1)
     return np.asarray(matches[np.argsort(matches[:, 0])].astype(np.int32))
 
 

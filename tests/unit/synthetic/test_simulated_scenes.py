@@ -13,7 +13,7 @@ from snakesfm.geometry.rotations import angle_of
 from snakesfm.matching.matcher import create_matcher
 from snakesfm.simulate import Simulation, SimulationOptions, main
 from snakesfm.synthetic.pairing import candidate_pairs, choose_partners, simulate_edge
-from snakesfm.synthetic.sightings import DetectorModel, match_appearances, sight
+from snakesfm.synthetic.sightings import DetectorModel, DistinctLooks, match_looks, sight
 from snakesfm.synthetic.surveys import LANDMARKS_PER_CELL, SURVEYS, AerialSurvey, StreetSurvey, Survey
 
 SIZES = {"aerial": 100, "street": 400}
@@ -74,7 +74,9 @@ def test_given_matches_resemble_those_of_the_real_matcher(survey: Survey) -> Non
     a, b = sight(survey, i, 3), sight(survey, j, 3)
     matcher = create_matcher("mutual_ratio")
     real, _ = matcher.match(matcher.prepare(a.keypoints), b.keypoints)
-    given = match_appearances(a.appearance, b.appearance, 0.65, np.random.default_rng(0))
+    given = match_looks(
+        DistinctLooks.of(a.appearance), DistinctLooks.of(b.appearance), 0.65, np.random.default_rng(0)
+    )
     right = [float(np.mean(a.landmarks[m[:, 0]] == b.landmarks[m[:, 1]])) for m in (real, given)]
     assert 0.6 < len(given) / len(real) < 1.6
     assert min(right) > 0.7
@@ -85,7 +87,18 @@ def test_strangers_match_by_look_alikes_only() -> None:
     survey = AerialSurvey(400, 0)
     a, b = sight(survey, 0, 0), sight(survey, 399, 0)
     assert not set(a.landmarks[a.landmarks >= 0]) & set(b.landmarks)
-    assert 3 < len(match_appearances(a.appearance, b.appearance, 0.65, np.random.default_rng(0))) < 60
+    assert (
+        3
+        < len(
+            match_looks(
+                DistinctLooks.of(a.appearance),
+                DistinctLooks.of(b.appearance),
+                0.65,
+                np.random.default_rng(0),
+            )
+        )
+        < 60
+    )
 
 
 def test_houses_hide_what_lies_behind_them() -> None:
@@ -134,7 +147,12 @@ def test_copies_give_a_consistent_wrong_pose() -> None:
         cells = found.landmarks // LANDMARKS_PER_CELL
         kinds, counts = np.unique(cells[cells >= 0], return_counts=True)
         rows.append(np.flatnonzero(cells == kinds[counts.argmax()]))
-    matches = match_appearances(a.appearance[rows[0]], b.appearance[rows[1]], 1.0, np.random.default_rng(0))
+    matches = match_looks(
+        DistinctLooks.of(a.appearance[rows[0]]),
+        DistinctLooks.of(b.appearance[rows[1]]),
+        1.0,
+        np.random.default_rng(0),
+    )
     shown = a.landmarks[rows[0]][matches[:, 0]], b.landmarks[rows[1]][matches[:, 1]]
     edge = simulate_edge(survey, (0, 399), shown, 0.5, 5)
     assert edge is not None and not edge.is_true
