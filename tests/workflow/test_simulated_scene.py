@@ -17,7 +17,7 @@ def test_the_workflow_goes_on_from_simulated_matches_to_an_accurate_model(
     folder = tmp_path / "field"
     options = SimulationOptions(images=60, until="match_pairs", partners=6, keypoints=1200, blocks=2)
     Simulation(folder, options).run()
-    outcome = workflow.run("--configfile", str(folder / "config.yaml"))
+    outcome = workflow.run("--configfile", str(folder / "config.yaml"), timeout=900)
     assert outcome.status == 0, outcome.text
     # what was simulated is taken as it is
     assert {"index_images", "extract_features", "select_pairs", "match_pairs"}.isdisjoint(outcome.rules)
