@@ -12,6 +12,8 @@ from pathlib import Path
 from benchmarks.growth.measure import TILED, Measurement
 from benchmarks.growth.needs import MARGIN, NEEDS, tile_pairs
 
+# last simulated stage -> numbers of images
+WANTED = {"extract_features": (50, 200, 500, 1000, 2000), "estimate_two_view": (1000, 5000, 10_000)}
 # below this much work, start-up hides how a stage grows
 LEAST_CPU = 1.0
 LEAST_IMAGES = 200
@@ -32,7 +34,7 @@ def exponent(points: Sequence[tuple[float, float]]) -> float | None:
 
 def write_report(measurements: Sequence[Measurement], path: Path, command: str) -> None:
     """Write the page."""
-    parts = [_head(command)]
+    parts = [_head(command), _gaps(measurements)]
     for survey in sorted({m.survey for m in measurements}):
         rows = sorted((m for m in measurements if m.survey == survey), key=lambda m: (m.images, m.first))
         parts += [f"## Survey '{survey}'", _scenes(rows), _stages(rows)]
@@ -61,6 +63,19 @@ artifacts of the stage named in "from". Seconds are processor seconds of one cor
 jobs, so that other work on the machine does not count; memory is the largest of a stage's jobs. The
 exponent p of cost ~ images^p is fitted to runs of {LEAST_IMAGES} images or more that need more than
 {LEAST_CPU:.0f} s; 1 is linear."""
+
+
+def _gaps(measurements: Sequence[Measurement]) -> str:
+    """The runs that the page should hold and does not."""
+    whole = {(m.first, m.images) for m in measurements if m.accuracy}
+    begun = {(m.first, m.images) for m in measurements} - whole
+    lines = [
+        f"{images:,} images from {first}{' (begun, not to the end)' if (first, images) in begun else ''}"
+        for first, sizes in WANTED.items()
+        for images in sizes
+        if (first, images) not in whole
+    ]
+    return f"Not run: {'; '.join(lines)}." if lines else "All runs of the plan were made."
 
 
 def _scenes(rows: Sequence[Measurement]) -> str:
@@ -134,13 +149,14 @@ def _future(measurements: Sequence[Measurement]) -> str:
     cores = FUTURE_NODES * FUTURE_CORES
     lines = []
     for stage, need in NEEDS.items():
-        cpu_hours, wall_hours = _hours(stage, need.parallel, measurements, images, pairs, cores)
+        cpu_hours, wall_hours, power = _hours(stage, need.parallel, measurements, images, pairs, cores)
         known = math.isfinite(cpu_hours)
         lines.append(
             [
                 f"`{stage}`",
                 f"{cpu_hours:.2f}" if known else "not measured",
                 f"{wall_hours:.2f}" if known else "-",
+                power if known else "-",
                 f"{need.mb(images, blocks, pairs) / 1024:.1f}",
             ]
         )
@@ -149,26 +165,29 @@ def _future(measurements: Sequence[Measurement]) -> str:
 Not run. {pairs:,} pairs ({2 * density:.0f} per image), {blocks} blocks,
 {blocks * (blocks + 1) // 2:,} tiles of about {tile_pairs(pairs, blocks):.0f} pairs.
 Stages that are cut into jobs have all cores; the others one core.
-Costs of the largest run, carried on with the fitted exponent where it is more than 1, else linearly.
+Costs of the largest run are carried on with the fitted exponent p, with 1 where it is less, and with 1
+too where too few runs were made to fit one ("assumed"): such a figure is a lower bound.
 
-{_table(["stage", "core hours", "hours", "GB per job"], lines)}"""
+{_table(["stage", "core hours", "hours", "p", "GB per job"], lines)}"""
 
 
 def _hours(
     stage: str, parallel: bool, measurements: Sequence[Measurement], images: int, pairs: int, cores: int
-) -> tuple[float, float]:
-    """Core hours and hours of a stage."""
+) -> tuple[float, float, str]:
+    """Core hours and hours of a stage, and the exponent that was used."""
     if stage == "extract_features":
         total = EXTRACT_CPU_PER_IMAGE * images
-        return total / 3600, total / 3600 / cores
+        return total / 3600, total / 3600 / cores, "per image"
     points = [(m.images, m.stages[stage].cpu) for m in measurements if stage in m.stages]
     if not points:
-        return math.nan, math.nan
+        return math.nan, math.nan, ""
     largest, cpu = max(points)
-    slope = max(exponent(points) or 1.0, 1.0)
+    fitted = exponent(points)
+    slope = max(fitted or 1.0, 1.0)
+    power = "assumed" if fitted is None else f"{slope:.2f}"
     if stage in TILED:
         need = max((m for m in measurements if stage in m.stages), key=lambda m: m.images).stages[stage]
-        total = need.cpu / need.pairs * pairs
+        total, power = need.cpu / need.pairs * pairs, "per pair"
     else:
         total = cpu * (images / largest) ** slope
-    return total / 3600, total / 3600 / (cores if parallel else 1)
+    return total / 3600, total / 3600 / (cores if parallel else 1), power

@@ -78,3 +78,5 @@ def test_the_page_holds_all_runs_and_says_what_was_not_run(tmp_path: Path) -> No
     row = next(line for line in text.splitlines() if line.startswith("| `build_tracks` | 5.0 s, 250 MB"))
     assert row.endswith("| 10.0 / 10.0 / 10.0 ms per image | 1.00 |")
     assert "not measured" in text
+    assert "1,000 images from estimate_two_view (begun, not to the end)" in text
+    assert "2,000 images from extract_features;" in text
