@@ -82,7 +82,7 @@ def sight(
     extra = int(count * model.clutter / (1.0 - model.clutter))
     frame = np.array([survey.camera.width, survey.camera.height], dtype=np.float64)
     pixels = np.concatenate([pixels, rng.random((extra, 2)) * frame])
-    sizes = np.concatenate([sizes, rng.uniform(*model.sizes_px, extra)])
+    sizes = np.concatenate([sizes, rng.choice(sizes, extra) if extra else sizes[:0]])
     ids = np.concatenate([landmarks.ids, np.full(extra, -1)])
     appearance = np.concatenate([landmarks.appearance, rng.integers(0, 1 << 63, extra, dtype=np.uint64)])
     scores = np.concatenate([landmarks.repeatability, rng.beta(1.2, 1.8, extra)])

@@ -73,7 +73,7 @@ def test_given_matches_resemble_those_of_the_real_matcher(survey: Survey) -> Non
     i, j = middle_pair(survey)
     a, b = sight(survey, i, 3), sight(survey, j, 3)
     matcher = create_matcher("mutual_ratio")
-    real, _ = matcher.match(matcher.prepare(a.keypoints), b.keypoints)
+    real, _ = matcher.match(matcher.prepare(a.keypoints), matcher.prepare_second(b.keypoints))
     given = match_looks(
         DistinctLooks.of(a.appearance), DistinctLooks.of(b.appearance), 0.65, np.random.default_rng(0)
     )
