@@ -302,6 +302,8 @@ class Simulation:
         }
         # the same choice at all sizes: 'auto' would take all pairs of few images
         content["select_pairs"] = {"method": "sequential+retrieval"}
+        # there are no images to refine keypoints in
+        content["adjust_bundle"] = {"refine_keypoints": False}
         if listed:
             content |= {"pairs": str(self.folder / "pairs.txt"), "select_pairs": {"method": "listed"}}
         with atomic_path(self.folder / "config.yaml") as temporary:
