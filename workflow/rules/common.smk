@@ -85,6 +85,15 @@ def job_params(stage):
     return render
 
 
+def gpus(stage):
+    """A resource function: the GPUs that a job of a stage makes use of."""
+
+    def count(wildcards):
+        return PLAN.scenes[wildcards.scene].gpus(stage)
+
+    return count
+
+
 def job_files():
     """A params function: the JSON that tells a job its scene and files; Snakemake tracks it by the files alone."""
 

@@ -10,6 +10,8 @@ rule extract_features:
         log_file("extract_features", "{block}"),
     benchmark:
         benchmark_file("extract_features", "{block}")
+    resources:
+        gpu=gpus("extract_features"),
     params:
         job=job_params("extract_features"),
         files=job_files(),

@@ -11,6 +11,8 @@ rule match_pairs:
         log_file("match_pairs", "{tile}"),
     benchmark:
         benchmark_file("match_pairs", "{tile}")
+    resources:
+        gpu=gpus("match_pairs"),
     params:
         job=job_params("match_pairs"),
         files=job_files(),

@@ -42,7 +42,7 @@ def column(shape: str, dtype: str, description: str) -> Any:
     ----------
     shape : symbolic shape such as ``"(P,2)"``; a letter must have one length in the whole artifact and
         ``P+1`` is one more than ``P``.
-    dtype : numpy dtype name, or ``"str"``.
+    dtype : numpy dtype name, several joined by ``|`` where the array's own is kept, or ``"str"``.
     description : one sentence with unit and frame, for docs/artifacts.md.
     """
     return dataclasses.field(metadata={"shape": shape, "dtype": dtype, "description": description})
@@ -72,6 +72,10 @@ class Artifact:
         if dtype == "str":
             return np.asarray([str(item) for item in value], dtype=object)
         array = np.asarray(value)
+        if "|" in dtype:
+            if array.dtype.name not in dtype.split("|"):
+                raise ValueError(f"{self.kind}.{field.name} is {array.dtype}, expected {dtype}")
+            dtype = array.dtype.name
         if array.size and not np.can_cast(array.dtype, dtype, casting="same_kind"):
             raise ValueError(f"{self.kind}.{field.name} is {array.dtype}, expected {dtype}")
         array = np.ascontiguousarray(array, dtype=dtype)

@@ -11,15 +11,21 @@ class LocalFeatures(Artifact):
     """Keypoints and descriptors of the images of one block, flat with row offsets."""
 
     kind: ClassVar[str] = "local_features"
+    format_version: ClassVar[int] = 2
 
     image_ids: Array = column("(n)", "int32", "row of the image in the index, ascending")
     names: Array = column("(n)", "str", "relative name of the image")
     digests: Array = column("(n)", "str", "digest of the image's pixels, options and stage version")
+    sizes: Array = column("(n,2)", "int32", "width and height of the image in pixels")
     offsets: Array = column("(n+1)", "int64", "rows offsets[k]:offsets[k+1] belong to image k")
     keypoints: Array = column("(K,2)", "float32", "x, y in original pixels, first pixel's centre (.5,.5)")
-    descriptors: Array = column("(K,D)", "uint8", "512 x RootSIFT, clipped to 255")
+    descriptors: Array = column(
+        "(K,D)",
+        "uint8|float16|float32",
+        "SIFT: uint8, 512 x RootSIFT clipped to 255; learned: float16 of unit length; D = 0 without any",
+    )
     scores: Array = column("(K)", "float32", "detector response, larger is stronger")
-    scales: Array = column("(K)", "float32", "diameter in original pixels, twice SIFT's sigma")
+    scales: Array = column("(K)", "float32", "diameter in original pixels; SIFT: twice sigma; learned: 1")
     angles: Array = column("(K)", "float32", "orientation in radians")
     colors: Array = column("(K,3)", "uint8", "RGB of the image at the keypoint")
 

@@ -61,6 +61,13 @@ class SceneInputs(BaseModel):
     """What bundle adjustment does with known intrinsics: keep them fixed, or refine them."""
     pairs: str = ""
     """File of image pairs, one 'name0 name1' a line, for select_pairs.method 'listed'; empty for none."""
+    imported: str = ""
+    """Folder with hloc's features.h5, matches.h5 and pairs.txt, for the front-end 'imported'."""
+
+
+FrontEndName = Literal[
+    "", "sift", "aliked+lightglue", "disk+lightglue", "xfeat+lighterglue", "virtual", "imported"
+]
 
 
 class RunOptions(BaseModel):
@@ -82,6 +89,12 @@ class RunOptions(BaseModel):
     """What bundle adjustment does with known intrinsics: keep them fixed, or refine them."""
     pairs: str = ""
     """File of image pairs, one 'name0 name1' a line, for select_pairs.method 'listed'; empty for none."""
+    imported: str = ""
+    """Folder with hloc's features.h5, matches.h5 and pairs.txt, for the front-end 'imported'."""
+    front_end: FrontEndName = ""
+    """Detector and matcher by one name; empty takes the methods of extract_features and match_pairs."""
+    weights: str = "weights"
+    """Folder of the learned methods' weights, filled by 'snakemake fetch_weights'; jobs never download."""
     scenes: dict[str, SceneInputs] = Field(default_factory=dict)
     """Several scenes: a mapping from name to images, reference, cameras, intrinsics and pairs."""
     seed: int = Field(default=0, ge=0)
@@ -94,7 +107,16 @@ class RunOptions(BaseModel):
     def _accept_numbers(cls, values: Any) -> Any:
         # --config scene=2024 arrives as a number
         if isinstance(values, dict):
-            for key in ("images", "output", "scene", "reference", "cameras", "pairs"):
+            for key in (
+                "images",
+                "output",
+                "scene",
+                "reference",
+                "cameras",
+                "pairs",
+                "imported",
+                "weights",
+            ):
                 if isinstance(values.get(key), int | float) and not isinstance(values[key], bool):
                     values = {**values, key: str(values[key])}
             if values.get("scenes") is None and "scenes" in values:

@@ -1,6 +1,6 @@
 """Options of extract_features."""
 
-from typing import ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 
@@ -10,13 +10,13 @@ from snakesfm.config.base import StageOptions
 class ExtractFeaturesOptions(StageOptions):
     """How keypoints are found and described."""
 
-    stage_version: ClassVar[int] = 1
+    stage_version: ClassVar[int] = 2
 
-    method: Literal["sift"] = "sift"
-    """Detector and descriptor: SIFT with RootSIFT descriptors."""
+    method: Literal["sift", "aliked", "disk", "xfeat", "virtual", "imported"] = "sift"
+    """SIFT with RootSIFT descriptors, a network, an oracle, or hloc's file: see docs/front_ends.md."""
 
-    max_keypoints: int = Field(5000, ge=16, le=100_000)
-    """Most keypoints kept per image, the strongest first."""
+    max_keypoints: Annotated[int, Field(ge=16, le=100_000)] | Literal["auto"] = "auto"
+    """Most keypoints kept per image, the strongest first; 'auto': 5000 of SIFT, 2048 of a network."""
 
     max_shorter_side_px: int = Field(760, ge=64, le=20_000)
     """Shorter side to which larger images are scaled down; keypoints stay in original pixels."""

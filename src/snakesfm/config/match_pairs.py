@@ -12,8 +12,8 @@ class MatchPairsOptions(StageOptions):
 
     stage_version: ClassVar[int] = 3
 
-    method: Literal["mutual_ratio"] = "mutual_ratio"
-    """Matcher: mutual nearest neighbours with the ratio test."""
+    method: Literal["mutual_ratio", "lightglue", "virtual", "imported"] = "mutual_ratio"
+    """Mutual nearest neighbours with the ratio test, a network, an oracle, or hloc's file."""
 
     max_ratio: float = Field(0.8, gt=0.0, le=1.0)
     """Largest ratio of the distances to the nearest and second nearest descriptor (1: no test)."""
@@ -32,3 +32,6 @@ class MatchPairsOptions(StageOptions):
 
     min_likeness: float = Field(1.5, ge=0.0)
     """Least resemblance of these keypoints in a pair that is matched; higher leaves more pairs out."""
+
+    min_score: float = Field(0.1, ge=0.0, le=1.0)
+    """Least confidence of a match that a network makes."""

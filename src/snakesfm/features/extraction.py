@@ -1,6 +1,8 @@
 """From an image to its strongest keypoints."""
 
+import importlib
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import cv2
@@ -12,7 +14,24 @@ from snakesfm.features.sift import SiftDetector
 
 Array = NDArray[Any]
 
-DETECTORS: dict[str, Callable[..., Detector]] = {"sift": SiftDetector}
+
+def _learned(name: str) -> Callable[..., Detector]:
+    """A detector of features.learned, whose libraries load when one is made."""
+
+    def make(**options: Any) -> Detector:
+        module = importlib.import_module("snakesfm.features.learned")
+        detector: Detector = getattr(module, name)(**options)
+        return detector
+
+    return make
+
+
+DETECTORS: dict[str, Callable[..., Detector]] = {
+    "sift": SiftDetector,
+    "aliked": _learned("AlikedDetector"),
+    "disk": _learned("DiskDetector"),
+    "xfeat": _learned("XfeatDetector"),
+}
 
 
 def create_detector(method: str, **options: Any) -> Detector:
@@ -42,6 +61,7 @@ def extract_keypoints(
     found = detector.detect(small_gray, small_rgb, max_keypoints)
     x, y = found.keypoints[:, 0], found.keypoints[:, 1]
     found = found.take(np.lexsort((found.angles, found.scales, x, y, -found.scores))[:max_keypoints])
+    found = replace(found, image_size=small_gray.shape[::-1])
     return found.scaled(width / small_gray.shape[1], height / small_gray.shape[0])
 
 

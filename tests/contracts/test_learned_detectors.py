@@ -1,0 +1,87 @@
+"""The detectors that are networks, with their real weights."""
+
+from types import SimpleNamespace
+from typing import ClassVar
+
+import numpy as np
+import pytest
+from contracts.test_detectors import DetectorContract, shapes
+
+from snakesfm.errors import ConfigError
+from snakesfm.features.extraction import create_detector, extract_keypoints
+from snakesfm.learned.checkpoints import read_checkpoint
+
+
+class LearnedDetectorContract(DetectorContract):
+    picture = staticmethod(shapes)
+    detectors: ClassVar[dict] = {}
+    size = 128
+    score_name = "keypoint_scores"
+    seen_size: tuple[int, int] | None = None
+
+    @pytest.fixture
+    def detector(self, weights):
+        if self.method not in self.detectors:
+            state = read_checkpoint(self.method, weights, "fetch")
+            self.detectors[self.method] = create_detector(self.method, state=state)
+        return self.detectors[self.method]
+
+    def test_descriptors_are_of_unit_length(self, detector):
+        found = extract_keypoints(detector, *shapes(), 300, 760)
+        lengths = np.linalg.norm(found.descriptors.astype(np.float64), axis=1)
+        np.testing.assert_allclose(lengths, 1, atol=2e-3)
+
+    def test_the_first_pixel_has_its_centre_at_a_half(self, detector, monkeypatch):
+        # a network's pixel (i, j) is (i + .5, j + .5), and larger where the network sees a smaller image
+        pixels = np.array([[0, 0], [7, 3], [90, 60]], np.float32)
+        width, height = 200, 150
+        seen = np.array(self.seen_size or (width, height))
+        monkeypatch.setattr(detector, "_network", self.fake(pixels * [width, height] / seen))
+        found = detector.detect(*shapes(width, height), 50)
+        np.testing.assert_allclose(found.keypoints, (pixels + 0.5) * [width, height] / seen, rtol=1e-6)
+
+    def fake(self, pixels):
+        """A network that finds just these pixels, in its own convention."""
+        import torch
+
+        tensors = {
+            "keypoints": torch.tensor(pixels, dtype=torch.float32),
+            "descriptors": torch.ones(len(pixels), self.size),
+            self.score_name: torch.ones(len(pixels)),
+        }
+        return lambda *_, **__: [SimpleNamespace(**tensors)]
+
+    def test_random_weights_run_through(self, weights):
+        found = create_detector(self.method, state=None).detect(*shapes(64, 96), 50)
+        assert found.descriptors.dtype == np.float16
+        assert found.keypoints.shape == (len(found), 2)
+
+    def test_weights_of_another_network_are_refused(self, weights):
+        other = "disk" if self.method != "disk" else "xfeat"
+        with pytest.raises(ConfigError, match="fetch the right ones"):
+            create_detector(self.method, state=read_checkpoint(other, weights, "fetch"))
+
+
+class TestAliked(LearnedDetectorContract):
+    method = "aliked"
+
+
+class TestDisk(LearnedDetectorContract):
+    method = "disk"
+    score_name = "detection_scores"
+
+
+class TestXfeat(LearnedDetectorContract):
+    method = "xfeat"
+    size = 64
+    seen_size = (192, 128)
+
+    def fake(self, pixels):
+        import torch
+
+        found = {
+            "keypoints": torch.tensor(pixels, dtype=torch.float32),
+            "descriptors": torch.ones(len(pixels), self.size),
+            "scores": torch.ones(len(pixels)),
+        }
+        return SimpleNamespace(detectAndCompute=lambda *_, **__: [found])

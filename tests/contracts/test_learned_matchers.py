@@ -1,0 +1,121 @@
+"""The matchers that are networks, with their real weights, on the keypoints they were trained on."""
+
+from typing import ClassVar
+
+import cv2
+import numpy as np
+import pytest
+from contracts.test_detectors import shapes
+
+from snakesfm.errors import ConfigError
+from snakesfm.features.extraction import create_detector, extract_keypoints
+from snakesfm.features.keypoints import KeypointSet
+from snakesfm.learned.checkpoints import read_checkpoint
+from snakesfm.matching.matcher import MATCHERS, create_matcher
+
+# a view of the picture from elsewhere: turned a little, smaller and in perspective
+VIEW = np.array([[0.9, -0.12, 30], [0.1, 0.92, -12], [1e-4, -2e-4, 1.0]])
+
+
+class LearnedMatcherContract:
+    """Inherit and set ``method`` and ``detector``."""
+
+    method = ""
+    detector = ""
+    median_error_px = 1.2
+    made: ClassVar[dict] = {}
+
+    @pytest.fixture
+    def matcher(self, weights):
+        key = (self.method, self.detector)
+        if key not in self.made:
+            state = read_checkpoint(f"{self.detector}_{self.method}", weights, "fetch")
+            self.made[key] = create_matcher(self.method, detector=self.detector, min_score=0.1, state=state)
+        return self.made[key]
+
+    @pytest.fixture
+    def images(self, weights):
+        """Keypoints of a picture, of a view of it, and of another picture."""
+        if self.detector not in self.made:
+            detector = create_detector(
+                self.detector, state=read_checkpoint(self.detector, weights, "fetch")
+            )
+            gray, _ = shapes(400, 300)
+            # the homography maps coordinates whose first pixel's centre is (0, 0)
+            pictures = [gray, cv2.warpPerspective(gray, VIEW, (400, 300)), shapes(400, 300, seed=9)[0]]
+            self.made[self.detector] = [
+                extract_keypoints(detector, p, np.repeat(p[..., None], 3, axis=2), 250, 760)
+                for p in pictures
+            ]
+        return self.made[self.detector]
+
+    def test_is_registered(self):
+        assert self.method in MATCHERS
+
+    def test_finds_what_a_homography_maps(self, matcher, images):
+        matches, scores = matcher.match(matcher.prepare(images[0]), matcher.prepare_second(images[1]))
+        assert matches.dtype == np.int32 and scores.dtype == np.float32
+        assert ((scores >= 0.1) & (scores <= 1)).all()
+        assert (np.diff(matches[:, 0]) > 0).all() and len(np.unique(matches[:, 1])) == len(matches)
+        start = np.column_stack([images[0].keypoints[matches[:, 0]] - 0.5, np.ones(len(matches))])
+        mapped = start @ VIEW.T
+        errors = np.linalg.norm(
+            mapped[:, :2] / mapped[:, 2:] + 0.5 - images[1].keypoints[matches[:, 1]], axis=1
+        )
+        assert len(matches) > 50
+        assert (errors < 4).mean() > 0.85
+        assert 0.05 < np.median(errors) < self.median_error_px
+
+    def test_unrelated_images_match_less(self, matcher, images):
+        prepared = matcher.prepare(images[0])
+        related, unrelated = (
+            matcher.match(prepared, matcher.prepare_second(second))[0] for second in images[1:]
+        )
+        assert len(unrelated) < 0.5 * len(related)
+
+    @pytest.mark.parametrize(("first", "second"), [(0, 0), (0, 50), (50, 0), (1, 1), (1, 50), (50, 1)])
+    def test_few_or_no_keypoints(self, matcher, images, first, second):
+        parts = [images[0].take(np.arange(first)), images[1].take(np.arange(second))]
+        matches, scores = matcher.match(matcher.prepare(parts[0]), matcher.prepare_second(parts[1]))
+        assert matches.shape == (len(scores), 2) and len(scores) <= min(first, second)
+        assert matches.dtype == np.int32 and scores.dtype == np.float32
+
+    def test_a_pair_does_not_depend_on_the_pairs_before_it(self, matcher, images):
+        prepared = matcher.prepare(images[0])
+        second = matcher.prepare_second(images[1])
+        expected = matcher.match(prepared, second)
+        matcher.match(prepared, matcher.prepare_second(images[2]))
+        for one, other in zip(expected, matcher.match(prepared, second), strict=True):
+            np.testing.assert_array_equal(one, other)
+
+    def test_a_larger_copy_of_the_images_matches_alike(self, matcher, images):
+        before, _ = matcher.match(matcher.prepare(images[0]), matcher.prepare_second(images[1]))
+        larger = [points.scaled(3, 3) for points in images[:2]]
+        after, _ = matcher.match(matcher.prepare(larger[0]), matcher.prepare_second(larger[1]))
+        same = set(map(tuple, before.tolist())) & set(map(tuple, after.tolist()))
+        assert len(same) > 0.95 * max(len(before), len(after))
+
+    def test_random_weights_run_through(self, images):
+        matcher = create_matcher(self.method, detector=self.detector, min_score=0.0, state=None)
+        matches, scores = matcher.match(matcher.prepare(images[0]), matcher.prepare_second(images[1]))
+        assert matches.shape == (len(scores), 2)
+
+    def test_descriptors_of_another_detector_are_refused(self, matcher):
+        with pytest.raises(ConfigError, match=r"extract_features\.method"):
+            matcher.prepare(KeypointSet.empty(32, np.float16))
+
+
+class TestAlikedLightglue(LearnedMatcherContract):
+    method = "lightglue"
+    detector = "aliked"
+
+
+class TestDiskLightglue(LearnedMatcherContract):
+    method = "lightglue"
+    detector = "disk"
+
+
+class TestXfeatLighterglue(LearnedMatcherContract):
+    method = "lightglue"
+    detector = "xfeat"
+    median_error_px = 1.8

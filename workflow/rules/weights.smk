@@ -1,0 +1,10 @@
+# The weights of the learned methods. Nothing depends on this rule: it runs where it is asked for by name.
+
+
+rule fetch_weights:
+    params:
+        python=sys.executable,
+        folder=str(PLAN.weights),
+        models=PLAN.models,
+    shell:
+        "{params.python} -m snakesfm.learned.fetch {params.folder:q} {params.models:q}"
