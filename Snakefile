@@ -29,7 +29,6 @@ include: "workflow/rules/reporting.smk"
 localrules:
     all,
     databases,
-    fetch_weights,
 
 
 rule all:

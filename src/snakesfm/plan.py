@@ -213,6 +213,11 @@ class ScenePlan:
         """The COLMAP database of features and two-view geometries, which only its own target makes."""
         return str(self.folder / "export_database" / "database.db")
 
+    def hloc_files(self) -> list[str]:
+        """Features and matches in hloc's files, which only their own target makes."""
+        names = ("features.h5", "matches.h5", "pairs.txt")
+        return [str(self.folder / "export_hloc" / name) for name in names]
+
     def all_files(self) -> list[str]:
         """What a run makes of the scene; Snakemake re-makes a lost file only if it is asked for by name."""
         files = [str(self.folder / name) for name in SCENE_ARTIFACTS]

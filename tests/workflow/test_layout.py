@@ -17,7 +17,7 @@ DOMAIN_MAY_IMPORT_NOT = (
     "snakemake",
 )
 NO_DOMAIN = {"stages", "artifacts", "config"}
-NO_STAGES = {"fetch_weights"}
+NO_STAGES = {"fetch_weights", "hloc"}
 
 
 def rule_texts(root: Path) -> dict[str, str]:

@@ -133,6 +133,11 @@ def all_databases():
     return [scene.database_file() for scene in PLAN.scenes.values()]
 
 
+def all_hloc_files():
+    """Features and matches of all scenes in hloc's files."""
+    return [path for scene in PLAN.scenes.values() for path in scene.hloc_files()]
+
+
 def start_run():
     """Lock the output folder for this run, and say what is about to be done."""
     try:

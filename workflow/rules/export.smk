@@ -21,6 +21,36 @@ rule export_database:
         job_command("export_database")
 
 
+localrules:
+    hloc,
+
+
+rule hloc:
+    input:
+        all_hloc_files(),
+
+
+rule export_hloc:
+    input:
+        index=artifact("index_images", "index.h5"),
+        features=files_of("extract_features", "blocks"),
+        matches=files_of("match_pairs", "tiles"),
+        geometries=files_of("estimate_two_view", "tiles"),
+    output:
+        artifact("export_hloc", "features.h5"),
+        artifact("export_hloc", "matches.h5"),
+        artifact("export_hloc", "pairs.txt"),
+    log:
+        log_file("export_hloc"),
+    benchmark:
+        benchmark_file("export_hloc")
+    params:
+        job=job_params("export_hloc"),
+        files=job_files(),
+    shell:
+        job_command("export_hloc")
+
+
 rule export_model:
     input:
         index=artifact("index_images", "index.h5"),

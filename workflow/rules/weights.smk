@@ -1,6 +1,10 @@
 # The weights of the learned methods. Nothing depends on this rule: it runs where it is asked for by name.
 
 
+localrules:
+    fetch_weights,
+
+
 rule fetch_weights:
     params:
         python=sys.executable,

@@ -30,6 +30,7 @@ STAGES: tuple[str, ...] = (
     "triangulate_tracks",
     "adjust_bundle",
     "export_database",
+    "export_hloc",
     "export_model",
     "evaluate_model",
     "render_report",

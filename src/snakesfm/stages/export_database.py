@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from snakesfm.config.export_database import ExportDatabaseOptions
 
 TEMPORARY = ".export."
+SIFT_SIZE = 128
 
 
 def run(job: StageJob) -> None:
@@ -75,8 +76,10 @@ def _write_features(database: "pycolmap.Database", path: Path, descriptors: bool
             part = slice(offsets[row], offsets[row + 1])
             keypoints = keypoint_rows(file["keypoints"][part], file["scales"][part], file["angles"][part])
             database.write_keypoints(image + 1, keypoints)
-            if descriptors:
-                database.write_descriptors(image + 1, sift_descriptors(file["descriptors"][part]))
+            # COLMAP's own descriptors are SIFT's; it cannot hold those of networks
+            column = file["descriptors"]
+            if descriptors and column.dtype == "uint8" and column.shape[1] == SIFT_SIZE:
+                database.write_descriptors(image + 1, sift_descriptors(column[part]))
 
 
 def _write_matches(database: "pycolmap.Database", path: Path) -> int:

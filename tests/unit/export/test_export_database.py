@@ -74,6 +74,7 @@ def write_inputs(folder: Path, problem: SyntheticProblem) -> dict[str, str | lis
             image_ids=images,
             names=[NAMES[image] for image in images],
             digests=["d"] * len(images),
+            sizes=np.tile(SIZE, (len(images), 1)),
             offsets=np.r_[0, np.cumsum(counts)],
             keypoints=np.concatenate([problem.keypoints[image] for image in images]),
             descriptors=np.concatenate(

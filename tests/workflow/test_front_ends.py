@@ -1,0 +1,83 @@
+"""Front-ends beside SIFT, from images to model."""
+
+import json
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from workflow_runner import Workflow, copy_run
+
+from snakesfm.artifacts import LocalFeatures
+from snakesfm.evaluation.colmap_model import read_model
+
+pytestmark = pytest.mark.workflow
+DEGREES = ("1", "2.5", "5", "10", "20")
+
+
+def run(workflow: Workflow, scene: Path, *config: str) -> dict:
+    outcome = workflow.run(
+        "--config", f"images={scene / 'images'}", f"reference={scene / 'reference'}", "output=out", *config
+    )
+    assert outcome.status == 0, outcome.text
+    return json.loads((workflow.folder / "out" / "square" / "evaluate_model" / "metrics.json").read_text())
+
+
+def test_the_oracle_leaves_no_error_to_the_back_end(small_scene: Path, workflow: Workflow) -> None:
+    metrics = run(workflow, small_scene, "front_end=virtual", f"cameras={small_scene / 'reference'}")
+    for degrees in DEGREES:
+        assert 99.5 <= metrics[f"pose_auc_{degrees}deg"] <= 100
+    assert metrics["reference_images_registered"] == 16
+    assert metrics["reprojection_error_px_mean"] < 0.01
+
+
+def test_hlocs_files_go_out_and_come_in_again(finished, small_scene: Path, workflow: Workflow) -> None:
+    copy_run(finished[0], workflow.folder)
+    config = [f"images={small_scene / 'images'}", f"reference={small_scene / 'reference'}", "output=out"]
+    outcome = workflow.run("hloc", "--config", *config)
+    assert outcome.status == 0, outcome.text
+    assert [rule for rule in outcome.rules if rule != "hloc"] == ["export_hloc"]
+    folder = workflow.folder / "out" / "square" / "export_hloc"
+    pairs = [line.split() for line in (folder / "pairs.txt").read_text().splitlines()]
+    with h5py.File(folder / "features.h5") as features, h5py.File(folder / "matches.h5") as matches:
+        assert len(features) == 16
+        for first, second in pairs:
+            partners = matches[first][second]["matches0"][()]
+            assert len(partners) == len(features[first]["keypoints"])
+            assert (partners >= 0).sum() > 10 and partners.max() < len(features[second]["keypoints"])
+
+    (workflow.folder / "again").mkdir()
+    again = Workflow(workflow.folder / "again")
+    metrics = run(again, small_scene, "front_end=imported", f"imported={folder}")
+    assert metrics["reference_images_registered"] == 16
+    before = json.loads((finished[0] / "evaluate_model" / "metrics.json").read_text())
+    for degrees in ("1", "3", "5"):
+        name = f"relative_pose_auc_{degrees}deg"
+        assert before[name] - 2 < metrics[name] <= 100
+    block = sorted((again.folder / "out" / "square" / "extract_features").glob("*.h5"))[0]
+    former = LocalFeatures.read(finished[0] / "extract_features" / block.name)
+    np.testing.assert_allclose(LocalFeatures.read(block).keypoints, former.keypoints, atol=1e-3)
+    assert read_model(again.folder / "out" / "square" / "export_model").num_reg_images() == 16
+
+
+def test_missing_weights_end_the_run_with_one_sentence(small_scene: Path, workflow: Workflow) -> None:
+    pytest.importorskip("torch", reason="the extra 'deep' is not installed")
+    outcome = workflow.run(
+        "--config", f"images={small_scene / 'images'}", "output=out", "front_end=xfeat+lighterglue"
+    )
+    assert outcome.status != 0
+    assert "Traceback" not in outcome.text
+    sentence = next(line for line in outcome.summary if "failed" in line)
+    assert "'snakemake fetch_weights --config front_end=xfeat+lighterglue weights=weights" in sentence
+
+
+def test_the_weights_are_fetched_by_their_own_target(
+    small_scene: Path, workflow: Workflow, weights: Path
+) -> None:
+    config = [f"images={small_scene / 'images'}", "output=out", "front_end=xfeat+lighterglue"]
+    outcome = workflow.run("fetch_weights", "--config", *config)
+    assert outcome.status == 0, outcome.text
+    names = sorted(path.name for path in (workflow.folder / "weights").iterdir())
+    assert names == ["SHA256SUMS", "xfeat-lighterglue.pt", "xfeat.pt"]
+    for name in names[1:]:
+        assert (workflow.folder / "weights" / name).read_bytes() == (weights / name).read_bytes()
