@@ -12,7 +12,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from snakesfm.artifacts import ARTIFACTS, Artifact, Header, ImagePairs, PairMatches, ViewGraph
+from snakesfm.artifacts import (
+    ARTIFACTS,
+    Artifact,
+    Header,
+    ImagePairs,
+    LocalFeatures,
+    PairMatches,
+    ViewGraph,
+)
 from snakesfm.artifacts.base import atomic_path
 from snakesfm.errors import ArtifactError
 
@@ -28,14 +36,16 @@ def example(cls: type[Artifact], lengths: dict[str, int]) -> Artifact:
         for dim in field.metadata["shape"].strip("()").split(","):
             name, _, more = dim.strip().partition("+")
             shape.append(int(name) if name.isdigit() else lengths.get(name, 3) + int(more or 0))
-        if field.metadata["dtype"] == "str":
+        # of several dtypes, whichever: all are kept as they are
+        dtype = field.metadata["dtype"].split("|")[-1]
+        if dtype == "str":
             values[field.name] = [f"näme {{{k}}} #{k}.JPG" for k in range(shape[0])]
-        elif field.metadata["dtype"] == "bool":
+        elif dtype == "bool":
             values[field.name] = rng.random(shape) < 0.5
-        elif field.metadata["dtype"].startswith("float"):
-            values[field.name] = rng.normal(size=shape).astype(field.metadata["dtype"])
+        elif dtype.startswith("float"):
+            values[field.name] = rng.normal(size=shape).astype(dtype)
         else:
-            values[field.name] = rng.integers(0, 100, shape).astype(field.metadata["dtype"])
+            values[field.name] = rng.integers(0, 100, shape).astype(dtype)
     return cls(**values)
 
 
@@ -139,3 +149,15 @@ def test_any_text_survives(tmp_path_factory: pytest.TempPathFactory, texts: list
     pairs = np.zeros((len(texts), 2), dtype=np.int32)
     ImagePairs(pairs=pairs, reasons=texts, similarities=np.zeros(len(texts))).write(path, HEADER)
     assert list(ImagePairs.read(path).reasons) == texts
+
+
+@pytest.mark.parametrize("dtype", ["uint8", "float16", "float32"])
+def test_descriptors_keep_their_dtype(tmp_path: Path, dtype: str) -> None:
+    made = dataclasses.replace(example(LocalFeatures, {}), descriptors=np.ones((3, 8), dtype))
+    made.write(tmp_path / "features.h5", HEADER)
+    assert LocalFeatures.read(tmp_path / "features.h5").descriptors.dtype == dtype
+
+
+def test_descriptors_of_another_dtype_are_refused() -> None:
+    with pytest.raises(ValueError, match=r"descriptors is int64, expected uint8\|float16\|float32"):
+        dataclasses.replace(example(LocalFeatures, {}), descriptors=np.ones((3, 8), np.int64))
