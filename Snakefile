@@ -24,6 +24,7 @@ include: "workflow/rules/matching.smk"
 include: "workflow/rules/mapping.smk"
 include: "workflow/rules/export.smk"
 include: "workflow/rules/reporting.smk"
+include: "workflow/rules/weights.smk"
 
 
 localrules:

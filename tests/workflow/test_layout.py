@@ -89,6 +89,8 @@ def test_domains_import_no_stage_no_artifact_and_no_workflow(file: Path) -> None
 
 def test_snakefile_is_a_table_of_contents(root: Path) -> None:
     lines = (root / "Snakefile").read_text().splitlines()
+    included = {line.split("/")[-1][:-1] for line in lines if line.startswith("include:")}
+    assert included == {file.name for file in (root / "workflow" / "rules").glob("*.smk")}
     assert len(lines) <= 60
     assert not [line for line in lines if re.match(r"\s*(def|lambda)\b", line)]
 

@@ -2,7 +2,7 @@
 
 import hashlib
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -109,7 +109,8 @@ class ImportedKeypoints:
         if columns is None:
             print(f"warning: {self._file.filename} has no keypoints of '{name}'")
             return KeypointSet.empty(self.descriptor_size, self.descriptor_dtype)
-        return KeypointSet(**columns, image_size=size)
+        names = ("keypoints", "descriptors", "scores", "scales", "angles")
+        return replace(KeypointSet(*(columns[column] for column in names)), image_size=size)
 
 
 def _digest(sha256: str, options: "ExtractFeaturesOptions", beside: str) -> str:

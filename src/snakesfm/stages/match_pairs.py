@@ -4,6 +4,7 @@ import functools
 import hashlib
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -143,7 +144,8 @@ class FeatureFiles:
     def read(self, image: int) -> KeypointSet:
         """The features of one image of the index."""
         columns, part, size, name = self._places[image]
-        return KeypointSet(*(column[part] for column in columns), size, name)
+        points = KeypointSet(*(column[part] for column in columns))
+        return replace(points, image_size=size, image_name=name)
 
 
 def _digest(first: str, second: str, options: "MatchPairsOptions", beside: str) -> str:
