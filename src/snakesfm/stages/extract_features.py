@@ -2,7 +2,7 @@
 
 import hashlib
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -109,8 +109,14 @@ class ImportedKeypoints:
         if columns is None:
             print(f"warning: {self._file.filename} has no keypoints of '{name}'")
             return KeypointSet.empty(self.descriptor_size, self.descriptor_dtype)
-        names = ("keypoints", "descriptors", "scores", "scales", "angles")
-        return replace(KeypointSet(*(columns[column] for column in names)), image_size=size)
+        return KeypointSet(
+            columns["keypoints"],
+            columns["descriptors"],
+            columns["scores"],
+            columns["scales"],
+            columns["angles"],
+            size,
+        )
 
 
 def _digest(sha256: str, options: "ExtractFeaturesOptions", beside: str) -> str:
