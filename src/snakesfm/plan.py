@@ -145,6 +145,9 @@ class ScenePlan:
         options: StageOptions = getattr(self.configuration, stage)
         if stage in ("extract_features", "match_pairs"):
             return options.model_copy(update={"method": self.method(stage)})
+        if stage == "adjust_bundle" and self.method("extract_features") == "virtual":
+            # what the images show is less exact than the projections of the model's points
+            return options.model_copy(update={"refine_keypoints": False})
         return options
 
     def models(self, stage: str) -> list[str]:
