@@ -20,14 +20,17 @@ FRONT_ENDS: dict[str, FrontEnd] = {
     "aliked+lightglue": FrontEnd("aliked", "lightglue"),
     "disk+lightglue": FrontEnd("disk", "lightglue"),
     "xfeat+lighterglue": FrontEnd("xfeat", "lightglue"),
+    "superpoint+lightglue": FrontEnd("superpoint", "lightglue"),
+    "superpoint+superglue": FrontEnd("superpoint", "superglue"),
     "virtual": FrontEnd("virtual", "virtual"),
     "imported": FrontEnd("imported", "imported"),
 }
 
-LEARNED_DETECTORS = ("aliked", "disk", "xfeat")
+LEARNED_DETECTORS = ("aliked", "disk", "xfeat", "superpoint")
 # the detectors whose keypoints a matcher understands; the others take any
 TRAINED_ON: dict[str, tuple[str, ...]] = {
     "lightglue": LEARNED_DETECTORS,
+    "superglue": ("superpoint",),
     "virtual": ("virtual",),
     "imported": ("imported",),
 }
@@ -60,8 +63,8 @@ def needed_weights(stage: str, options: Any, detector: str) -> list[str]:
     """
     if stage == "extract_features" and options.method in LEARNED_DETECTORS:
         return [options.method]
-    if stage == "match_pairs" and options.method == "lightglue":
-        return [f"{detector}_lightglue"]
+    if stage == "match_pairs" and options.method in ("lightglue", "superglue"):
+        return [f"{detector}_{options.method}"]
     return []
 
 

@@ -85,3 +85,42 @@ class TestXfeat(LearnedDetectorContract):
             "scores": torch.ones(len(pixels)),
         }
         return SimpleNamespace(detectAndCompute=lambda *_, **__: [found])
+
+
+class TestSuperpointOfRandomWeights(DetectorContract):
+    method = "superpoint"
+    picture = staticmethod(shapes)
+    made: ClassVar[list] = []
+
+    @pytest.fixture
+    def detector(self):
+        pytest.importorskip("transformers", reason="the extra 'deep' is not installed")
+        if not self.made:
+            import torch
+
+            torch.manual_seed(0)
+            self.made.append(create_detector(self.method, state=None))
+        return self.made[0]
+
+    def test_the_first_pixel_has_its_centre_at_a_half(self, detector, monkeypatch):
+        import torch
+
+        pixels = torch.tensor([[8.0, 9.0], [100.0, 50.0]])
+        monkeypatch.setattr(
+            detector._network.keypoint_decoder, "forward", lambda encoded: (pixels, torch.ones(2))
+        )
+        found = detector.detect(*shapes(203, 149), 50)
+        np.testing.assert_array_equal(found.keypoints, [[8.5, 9.5], [100.5, 50.5]])
+        lengths = np.linalg.norm(found.descriptors.astype(np.float64), axis=1)
+        np.testing.assert_allclose(lengths, 1, atol=2e-3)
+
+    def test_its_weights_survive_their_file(self, detector, tmp_path):
+        from safetensors.torch import save_file
+
+        save_file(detector._network.state_dict(), tmp_path / "superpoint.safetensors")
+        again = create_detector(self.method, state=read_checkpoint(self.method, tmp_path, "fetch"))
+        one, other = (extract_keypoints(d, *shapes(), 50, 760) for d in (detector, again))
+        np.testing.assert_array_equal(one.descriptors, other.descriptors)
+        (tmp_path / "superpoint.safetensors").write_bytes(b"damaged")
+        with pytest.raises(ConfigError, match="holds no weights"):
+            read_checkpoint(self.method, tmp_path, "fetch")

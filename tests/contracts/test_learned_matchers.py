@@ -119,3 +119,63 @@ class TestXfeatLighterglue(LearnedMatcherContract):
     method = "lightglue"
     detector = "xfeat"
     median_error_px = 1.8
+
+
+@pytest.mark.parametrize("method", ["lightglue", "superglue"])
+class TestSuperpointMatchersOfRandomWeights:
+    """Their real weights are not to be had here: shapes, and what a pair depends on."""
+
+    made: ClassVar[dict] = {}
+
+    @pytest.fixture
+    def matcher(self, method):
+        pytest.importorskip("transformers", reason="the extra 'deep' is not installed")
+        if method not in self.made:
+            import torch
+
+            torch.manual_seed(0)
+            self.made[method] = create_matcher(method, detector="superpoint", min_score=0.0, state=None)
+        return self.made[method]
+
+    @staticmethod
+    def points(count, seed, size=(320, 240)):
+        rng = np.random.default_rng(seed)
+        vectors = rng.normal(size=(count, 256))
+        return KeypointSet(
+            (rng.uniform(size=(count, 2)) * size).astype(np.float32),
+            (vectors / np.linalg.norm(vectors, axis=1, keepdims=True)).astype(np.float16),
+            rng.uniform(size=count).astype(np.float32),
+            np.ones(count, np.float32),
+            np.zeros(count, np.float32),
+            size,
+        )
+
+    @pytest.mark.parametrize("counts", [(0, 5), (5, 0), (1, 5), (30, 50), (50, 30), (40, 40)])
+    def test_matches_are_one_to_one(self, matcher, counts):
+        first, second = self.points(counts[0], 1), self.points(counts[1], 2, (200, 300))
+        matches, scores = matcher.match(matcher.prepare(first), matcher.prepare_second(second))
+        assert matches.shape == (len(scores), 2)
+        assert matches.dtype == np.int32 and scores.dtype == np.float32
+        assert min(counts) < 2 or len(matches) > 0
+        assert (np.diff(matches[:, 0]) > 0).all() and len(np.unique(matches[:, 1])) == len(matches)
+        assert len(matches) == 0 or (matches.max(axis=0) < counts).all()
+        assert ((scores >= 0) & (scores <= 1)).all()
+
+    def test_images_of_any_scale_match_alike(self, matcher):
+        first, second = self.points(40, 1), self.points(40, 2)
+        before = matcher.match(matcher.prepare(first), matcher.prepare_second(second))
+        after = matcher.match(matcher.prepare(first.scaled(4, 4)), matcher.prepare_second(second))
+        np.testing.assert_array_equal(before[0], after[0])
+        np.testing.assert_allclose(before[1], after[1], rtol=1e-3)
+
+    def test_padding_changes_nothing(self, matcher):
+        first, second = self.points(40, 1), self.points(25, 2)
+        matches, scores = matcher.match(matcher.prepare(first), matcher.prepare_second(second))
+        turned = matcher.match(matcher.prepare(second), matcher.prepare_second(first))
+        order = np.argsort(turned[0][:, 1])
+        np.testing.assert_array_equal(matches, turned[0][order][:, ::-1])
+        np.testing.assert_allclose(scores, turned[1][order], rtol=1e-3, atol=1e-7)
+
+    def test_descriptors_of_another_detector_are_refused(self, matcher):
+        with pytest.raises(ConfigError, match=r"extract_features\.method"):
+            matcher.prepare(KeypointSet.empty(128, np.float16))

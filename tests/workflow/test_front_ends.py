@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from workflow_runner import Workflow, copy_run
 
-from snakesfm.artifacts import LocalFeatures
+from snakesfm.artifacts import LocalFeatures, PairMatches
 from snakesfm.evaluation.colmap_model import read_model
 
 pytestmark = pytest.mark.workflow
@@ -81,3 +81,43 @@ def test_the_weights_are_fetched_by_their_own_target(
     assert names == ["SHA256SUMS", "xfeat-lighterglue.pt", "xfeat.pt"]
     for name in names[1:]:
         assert (workflow.folder / "weights" / name).read_bytes() == (weights / name).read_bytes()
+
+
+def test_superpoint_and_superglue_run_through_with_random_weights(
+    small_scene: Path, workflow: Workflow
+) -> None:
+    pytest.importorskip("transformers", reason="the extra 'deep' is not installed")
+    from safetensors.torch import save_file
+
+    from snakesfm.features.extraction import create_detector
+    from snakesfm.matching.matcher import create_matcher
+
+    folder = workflow.folder / "weights"
+    folder.mkdir()
+    networks = {
+        "superpoint": create_detector("superpoint", state=None),
+        "superglue_outdoor": create_matcher("superglue", detector="superpoint", min_score=0.0, state=None),
+    }
+    for name, made in networks.items():
+        save_file(made._network.state_dict(), folder / f"{name}.safetensors")
+    outcome = workflow.run(
+        "--until",
+        "match_pairs",
+        "--config",
+        f"images={small_scene / 'images'}",
+        "output=out",
+        "front_end=superpoint+superglue",
+        "extract_features={max_keypoints: 64}",
+        "select_pairs={method: sequential, look_ahead: 1}",
+        "match_pairs={min_score: 0.0}",
+    )
+    assert outcome.status == 0, outcome.text
+    out = workflow.folder / "out" / "square"
+    features = [LocalFeatures.read(path) for path in sorted((out / "extract_features").glob("*.h5"))]
+    assert sum(len(block.image_ids) for block in features) == 16
+    for block in features:
+        assert block.descriptors.dtype == np.float16 and block.descriptors.shape[1] == 256
+        assert (np.diff(block.offsets) == 64).all()
+    tiles = [PairMatches.read(path) for path in sorted((out / "match_pairs").glob("*.h5"))]
+    assert sum(len(tile.pairs) for tile in tiles) == 15
+    assert all((np.diff(tile.offsets) > 0).all() for tile in tiles)

@@ -67,7 +67,15 @@ class SceneInputs(BaseModel):
 
 
 FrontEndName = Literal[
-    "", "sift", "aliked+lightglue", "disk+lightglue", "xfeat+lighterglue", "virtual", "imported"
+    "",
+    "sift",
+    "aliked+lightglue",
+    "disk+lightglue",
+    "xfeat+lighterglue",
+    "superpoint+lightglue",
+    "superpoint+superglue",
+    "virtual",
+    "imported",
 ]
 
 

@@ -12,7 +12,7 @@ class ExtractFeaturesOptions(StageOptions):
 
     stage_version: ClassVar[int] = 2
 
-    method: Literal["sift", "aliked", "disk", "xfeat", "virtual", "imported"] = "sift"
+    method: Literal["sift", "aliked", "disk", "xfeat", "superpoint", "virtual", "imported"] = "sift"
     """SIFT with RootSIFT descriptors, a network, an oracle, or hloc's file: see docs/front_ends.md."""
 
     max_keypoints: Annotated[int, Field(ge=16, le=100_000)] | Literal["auto"] = "auto"

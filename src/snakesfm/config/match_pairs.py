@@ -12,7 +12,7 @@ class MatchPairsOptions(StageOptions):
 
     stage_version: ClassVar[int] = 3
 
-    method: Literal["mutual_ratio", "lightglue", "virtual", "imported"] = "mutual_ratio"
+    method: Literal["mutual_ratio", "lightglue", "superglue", "virtual", "imported"] = "mutual_ratio"
     """Mutual nearest neighbours with the ratio test, a network, an oracle, or hloc's file."""
 
     max_ratio: float = Field(0.8, gt=0.0, le=1.0)

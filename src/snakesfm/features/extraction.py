@@ -31,6 +31,7 @@ DETECTORS: dict[str, Callable[..., Detector]] = {
     "aliked": _learned("AlikedDetector"),
     "disk": _learned("DiskDetector"),
     "xfeat": _learned("XfeatDetector"),
+    "superpoint": _learned("SuperpointDetector"),
 }
 
 

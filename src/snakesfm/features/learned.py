@@ -1,4 +1,4 @@
-"""Detectors that are networks: ALIKED, DISK and XFeat by kornia."""
+"""Detectors that are networks: ALIKED, DISK and XFeat by kornia, SuperPoint by transformers."""
 
 from collections.abc import Mapping
 from typing import Any, ClassVar
@@ -119,3 +119,29 @@ class XfeatDetector(LearnedDetector):
         ratio = sides / (sides // self.multiple * self.multiple)
         places = to_array(found["keypoints"], np.float64) + CENTER_SHIFT * ratio
         return places.astype(np.float32), found["descriptors"], found["scores"]
+
+
+class SuperpointDetector(LearnedDetector):
+    """SuperPoint (DeTone et al. 2018), by transformers: keypoints at whole pixels.
+
+    Parameters
+    ----------
+    state : weights under the names of transformers; None for random ones.
+    """
+
+    descriptor_size = 256
+    stride = 8
+
+    def __init__(self, state: Mapping[str, Any] | None) -> None:
+        from transformers import SuperPointConfig, SuperPointForKeypointDetection
+
+        network = SuperPointForKeypointDetection(SuperPointConfig())
+        self._network = fill_network(network, state, "SuperPoint")
+
+    def _infer(self, gray: Array, rgb: Array, max_keypoints: int) -> tuple[Array, Any, Any]:
+        # the encoder halves the image three times and leaves out what is over
+        height, width = (side // self.stride * self.stride for side in gray.shape)
+        encoded = self._network.encoder(to_tensor(gray[:height, :width]))[0]
+        places, scores = self._network.keypoint_decoder(encoded)
+        descriptors = self._network.descriptor_decoder(encoded, places)
+        return to_array(places, np.float32) + np.float32(CENTER_SHIFT), descriptors, scores

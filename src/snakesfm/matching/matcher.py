@@ -108,6 +108,7 @@ MATCHERS: dict[str, Callable[..., Matcher]] = {
     "mutual_ratio": MutualRatioMatcher,
     "virtual": IdentityMatcher,
     "lightglue": _learned("lightglue", "LightglueMatcher"),
+    "superglue": _learned("superglue", "SuperglueMatcher"),
 }
 
 
