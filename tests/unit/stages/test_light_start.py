@@ -10,7 +10,7 @@ import pytest
 from snakesfm.config.configuration import STAGES, options_class
 from snakesfm.stages.job import JobOptions
 
-HEAVY = ("pydantic", "scipy", "pycolmap", "cv2", "gtsam", "poselib", "pandas", "PIL", "jinja2", "plotly")
+HEAVY = ("pydantic", "scipy", "pycolmap", "cv2", "gtsam", "poselib", "pandas", "PIL", "jinja2", "plotly", "torch")
 NEEDED = {
     "extract_features": {"cv2", "PIL"},
     "index_images": {"cv2", "pycolmap", "PIL"},
