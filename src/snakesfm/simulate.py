@@ -183,6 +183,7 @@ class Simulation:
             image_ids=images,
             names=np.array(names, dtype=object),
             digests=np.array([self._digest("features", name) for name in names], dtype=object),
+            sizes=np.tile([self.survey.camera.width, self.survey.camera.height], (len(images), 1)),
             offsets=offsets,
             keypoints=_join([s.keypoints.keypoints for s in sightings], (0, 2), "float32"),
             descriptors=_join([s.keypoints.descriptors for s in sightings], (0, size), "uint8"),

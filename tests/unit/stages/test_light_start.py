@@ -10,7 +10,19 @@ import pytest
 from snakesfm.config.configuration import STAGES, options_class
 from snakesfm.stages.job import JobOptions
 
-HEAVY = ("pydantic", "scipy", "pycolmap", "cv2", "gtsam", "poselib", "pandas", "PIL", "jinja2", "plotly", "torch")
+HEAVY = (
+    "pydantic",
+    "scipy",
+    "pycolmap",
+    "cv2",
+    "gtsam",
+    "poselib",
+    "pandas",
+    "PIL",
+    "jinja2",
+    "plotly",
+    "torch",
+)
 NEEDED = {
     "extract_features": {"cv2", "PIL"},
     "index_images": {"cv2", "pycolmap", "PIL"},
