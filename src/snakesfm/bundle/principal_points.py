@@ -27,7 +27,7 @@ def find_told_cameras(
     adjust: BundleAdjuster,
     solving: SolverSettings,
     max_gap: float,
-    max_offset: float,
+    offsets: tuple[float, float],
 ) -> frozenset[int]:
     """Ids of the cameras whose principal point is the same by either half of the points.
 
@@ -39,7 +39,8 @@ def find_told_cameras(
     reconstruction : an adjusted model; stays as it is.
     adjust, solving : the solver; cameras that it holds are no candidates.
     max_gap : largest distance of the two principal points, as a share of the image's longer side.
-    max_offset : largest distance from the principal point so far, likewise; the smallest is three gaps.
+    offsets : smallest and largest distance from the principal point so far, likewise; it must be three gaps
+        too. Both halves share what the model as a whole gets wrong, so small distances prove nothing.
     """
     candidates = _candidates(reconstruction, solving.constant_cameras)
     if not candidates:
@@ -54,7 +55,8 @@ def find_told_cameras(
         gap = float(np.linalg.norm(first - second))
         offset = float(np.linalg.norm(0.5 * (first + second) - principal_point(camera)))
         longer = max(camera.width, camera.height)
-        if gap < max_gap * longer and SIGNIFICANCE * gap < offset < max_offset * longer:
+        smallest = max(SIGNIFICANCE * gap, offsets[0] * longer)
+        if gap < max_gap * longer and smallest < offset < offsets[1] * longer:
             told.add(camera_id)
     return frozenset(told)
 

@@ -41,6 +41,7 @@ class RoundSettings:
     distortion_from_round: int = 2
     refine_principal_points: bool = True
     max_principal_point_gap: float = 0.003
+    min_principal_point_offset: float = 0.004
     max_principal_point_offset: float = 0.02
     max_focal_change: float = 3.0
     max_distortion: float = 1.0
@@ -216,7 +217,7 @@ class _Mapper:
             self.adjust,
             solving,
             self.settings.max_principal_point_gap,
-            self.settings.max_principal_point_offset,
+            (self.settings.min_principal_point_offset, self.settings.max_principal_point_offset),
         )
         if not told:
             return

@@ -10,7 +10,7 @@ from snakesfm.config.base import StageOptions
 class AdjustBundleOptions(StageOptions):
     """How cameras, poses and points are adjusted together."""
 
-    stage_version: ClassVar[int] = 4
+    stage_version: ClassVar[int] = 5
 
     solver: Literal["ceres", "gtsam"] = "ceres"
     """Least-squares solver: Ceres through pycolmap, or gtsam (slower, fewer camera models)."""
@@ -47,6 +47,9 @@ class AdjustBundleOptions(StageOptions):
 
     max_principal_point_gap: float = Field(default=0.003, gt=0.0, le=1.0)
     """Distance, over the longer side, up to which two halves of the points must tell it alike."""
+
+    min_principal_point_offset: float = Field(default=0.004, ge=0.0, le=1.0)
+    """Distance from the start, over the longer side, below which a principal point stays where it was."""
 
     max_principal_point_offset: float = Field(default=0.02, gt=0.0, le=1.0)
     """Distance from the start, over the longer side, beyond which a principal point is not believed."""

@@ -59,8 +59,18 @@ def test_a_well_told_principal_point_is_found():
         {"camera": OFFSET, "max_principal_point_gap": 1e-6},
         {"camera": CENTRED},
         {"camera": FAR_OFF},
+        {"camera": OFFSET, "min_principal_point_offset": 0.01},
     ],
-    ids=["noisy", "one image each", "switched off", "held", "no gap", "centred", "not believable"],
+    ids=[
+        "noisy",
+        "one image each",
+        "switched off",
+        "held",
+        "no gap",
+        "centred",
+        "not believable",
+        "too near",
+    ],
 )
 def test_other_principal_points_stay(case):
     params, names = refined(**case)
