@@ -39,6 +39,9 @@ rule export_model:
         log_file("export_model"),
     benchmark:
         benchmark_file("export_model")
+    resources:
+        mem_mb=memory_mb("export_model"),
+        runtime=runtime_min("export_model"),
     params:
         job=job_params("export_model"),
         files=job_files(),
@@ -57,6 +60,9 @@ rule evaluate_model:
         log_file("evaluate_model"),
     benchmark:
         benchmark_file("evaluate_model")
+    resources:
+        mem_mb=memory_mb("evaluate_model"),
+        runtime=runtime_min("evaluate_model"),
     params:
         job=job_params("evaluate_model"),
         files=job_files(),

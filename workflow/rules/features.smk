@@ -10,6 +10,9 @@ rule extract_features:
         log_file("extract_features", "{block}"),
     benchmark:
         benchmark_file("extract_features", "{block}")
+    resources:
+        mem_mb=memory_mb("extract_features"),
+        runtime=runtime_min("extract_features"),
     params:
         job=job_params("extract_features"),
         files=job_files(),
@@ -26,6 +29,9 @@ rule learn_vocabulary:
         log_file("learn_vocabulary"),
     benchmark:
         benchmark_file("learn_vocabulary")
+    resources:
+        mem_mb=memory_mb("learn_vocabulary"),
+        runtime=runtime_min("learn_vocabulary"),
     params:
         job=job_params("learn_vocabulary"),
         files=job_files(),
@@ -43,6 +49,9 @@ rule describe_images:
         log_file("describe_images", "{block}"),
     benchmark:
         benchmark_file("describe_images", "{block}")
+    resources:
+        mem_mb=memory_mb("describe_images"),
+        runtime=runtime_min("describe_images"),
     params:
         job=job_params("describe_images"),
         files=job_files(),
@@ -67,6 +76,9 @@ for blocks, scenes in PLAN.scenes_by_blocks().items():
             benchmark_file("select_pairs")
         wildcard_constraints:
             scene=any_of(scenes),
+        resources:
+            mem_mb=memory_mb("select_pairs"),
+            runtime=runtime_min("select_pairs"),
         params:
             job=job_params("select_pairs"),
             files=job_files(),
