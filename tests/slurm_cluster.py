@@ -153,15 +153,11 @@ class Cluster:
         munged += [f"--log-file={self.folder / 'munged.log'}", f"--seed-file={self.folder / 'munge.seed'}"]
         self._spawn("munged", munged)
         wait_for((self.folder / "munge.socket").exists, "munged")
-        self.start_controller()
+        self._spawn("slurmctld", ["slurmctld", "-D", "-f", str(self.configuration)])
+        wait_for(lambda: "UP" in self.call("scontrol", "ping"), "slurmctld")
         for name in self.names:
             self.start_node(name)
         self.wait_for_nodes("idle")
-
-    def start_controller(self) -> None:
-        """Start slurmctld, with the jobs it had before it was stopped."""
-        self._spawn("slurmctld", ["slurmctld", "-D", "-f", str(self.configuration)])
-        wait_for(lambda: "UP" in self.call("scontrol", "ping"), "slurmctld")
 
     def start_node(self, name: str) -> None:
         """Start one slurmd."""

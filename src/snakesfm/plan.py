@@ -19,9 +19,10 @@ from snakesfm.errors import ConfigError
 from snakesfm.ingest.discover import count_images, fingerprint_images
 from snakesfm.resources import NEEDS, Load
 
-# images up to which so many blocks are used; powers of two, so that adding images rarely re-deals them
-BLOCK_LADDER = ((60, 2), (500, 4), (1_500, 8), (4_000, 16), (15_000, 32), (50_000, 64))
-MOST_BLOCKS = 128
+# images up to which so many blocks are used: few steps, so that adding images rarely re-deals them, and few
+# enough blocks that a tile of some 25 pairs per image takes half a minute or more
+BLOCK_LADDER = ((60, 2), (1_000, 4), (4_000, 8), (16_000, 16), (60_000, 32))
+MOST_BLOCKS = 48
 
 SCENE_ARTIFACTS = (
     "index_images/index.h5",

@@ -7,7 +7,6 @@ import shutil
 import signal
 import tempfile
 import threading
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -95,13 +94,6 @@ class Storm:
         wait_for(lambda: self.cluster.job(number)["JobState"] == "NODE_FAIL", "a lost node", 120)
         self.cluster.start_node(node)
 
-    def lose_controller(self) -> None:
-        """Be without SLURM's controller for a while."""
-        wait_for_process(self.logs / "build_tracks" / "job.log")
-        self.cluster.kill("slurmctld", signal.SIGTERM)
-        time.sleep(8)
-        self.cluster.start_controller()
-
 
 @pytest.fixture(scope="module")
 def survived(
@@ -121,11 +113,11 @@ def survived(
         *config_of(small_scene),
     )
     storm = Storm(cluster, folder / "out" / "square")
-    faults = [storm.hang, storm.cancel, storm.lose_node, storm.lose_controller]
+    faults = [storm.hang, storm.cancel, storm.lose_node]
     threads = [threading.Thread(target=fault, daemon=True) for fault in faults]
     for thread in threads:
         thread.start()
-    text, _ = run.communicate(timeout=600)
+    text, _ = run.communicate(timeout=900)
     assert run.returncode == 0, text
     for thread in threads:
         thread.join(30)
