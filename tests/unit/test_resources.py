@@ -1,5 +1,7 @@
 """What jobs ask a cluster for."""
 
+from pathlib import Path
+
 import pytest
 
 from snakesfm.config.configuration import STAGES
@@ -24,3 +26,11 @@ def test_small_scenes_fit_a_laptop_and_large_ones_a_node(stage: str) -> None:
     assert 500 <= memory_mb(stage, Load(50, 1225)) <= 3_000
     assert memory_mb(stage, Load(10_000, 120_000)) <= 100_000
     assert 15 <= runtime_min(stage, Load(50, 1225)) <= 30
+
+
+@pytest.mark.parametrize("stage", STAGES)
+def test_the_page_on_clusters_names_the_needs(root: Path, stage: str) -> None:
+    need = NEEDS[stage]
+    numbers = (need.constant_mb, need.image_mb, need.pair_mb, need.image_s, need.pair_s)
+    row = f"| `{stage}` | {need.grain} | " + " | ".join(f"{number:g}" for number in numbers) + " |"
+    assert row in (root / "docs" / "cluster.md").read_text()

@@ -101,7 +101,8 @@ def survived(
 ) -> tuple[Path, str, dict[str, str]]:
     """A whole run in a storm: its output folder, what it printed, and the SLURM jobs that were hit."""
     folder = tmp_path_factory.mktemp("storm")
-    run = Workflow(folder, "slurm", cluster.environment).start(
+    shared = {"SNAKESFM_CACHE": str(folder / "shared")}
+    run = Workflow(folder, "slurm", {**cluster.environment, **shared}).start(
         *QUICK,
         # each tile has a node of its own
         *("--retries", "3", "--set-threads", "match_pairs=2"),
@@ -129,6 +130,11 @@ def test_a_run_on_slurm_gives_the_model_of_a_local_run_whatever_happens(finished
     assert model_bytes(output) == model_bytes(finished[0])
     assert not list(output.rglob("*.tmp"))
     assert not list(output.rglob("*.refused"))
+
+
+def test_the_folder_that_runs_share_is_used_on_the_nodes(survived) -> None:
+    kept = [path.parts[-3] for path in (survived[0].parents[1] / "shared").rglob("*.h5")]
+    assert sorted(kept) == ["estimate_two_view"] * 3 + ["extract_features"] * 2 + ["match_pairs"] * 3
 
 
 def test_logs_of_all_jobs_are_with_the_scene(finished, survived) -> None:

@@ -14,6 +14,9 @@ rule export_database:
         log_file("export_database"),
     benchmark:
         benchmark_file("export_database")
+    resources:
+        mem_mb=memory_mb("export_database"),
+        runtime=runtime_min("export_database"),
     params:
         job=job_params("export_database"),
         files=job_files(),
