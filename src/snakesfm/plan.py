@@ -19,8 +19,8 @@ from snakesfm.errors import ConfigError
 from snakesfm.ingest.discover import count_images, fingerprint_images
 from snakesfm.resources import NEEDS, Load
 
-# images up to which so many blocks are used: few steps, so that adding images rarely re-deals them, and few
-# enough blocks that a tile of some 25 pairs per image takes half a minute or more
+# images up to which so many blocks are used: few steps, so that adding images rarely re-deals them, and so
+# few blocks that a tile takes about half a minute at the upper end of a step (docs/cluster.md)
 BLOCK_LADDER = ((60, 2), (1_000, 4), (4_000, 8), (16_000, 16), (60_000, 32))
 MOST_BLOCKS = 48
 

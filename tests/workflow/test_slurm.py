@@ -200,12 +200,15 @@ def test_a_controller_that_is_ended_leaves_nothing_that_hinders_the_next(
 def test_jobs_that_cannot_be_ended_are_named_with_what_to_type(
     finished, small_scene: Path, tmp_path: Path
 ) -> None:
-    workflow = Workflow(tmp_path)
     copy_run(finished[0], tmp_path)
     (tmp_path / "out" / "square" / "render_report" / "index.html").unlink()
     (tmp_path / "out" / ".snakesfm.lock").write_text("process 1 on elsewhere, SLURM run some-name\n")
-    nowhere = {**os.environ, "SLURM_CONF": "/nonexistent"}
-    outcome = Workflow(workflow.folder, environment=nowhere).run(*config_of(small_scene))
+    programs = tmp_path / "bin"
+    programs.mkdir()
+    (programs / "squeue").write_text("#!/bin/sh\nexit 1\n")
+    (programs / "squeue").chmod(0o755)
+    silent = {**os.environ, "PATH": f"{programs}:{os.environ['PATH']}"}
+    outcome = Workflow(tmp_path, environment=silent).run(*config_of(small_scene))
     assert outcome.status != 0
     assert "scancel --name=some-name" in outcome.text
     assert outcome.rules == []
