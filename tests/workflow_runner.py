@@ -8,7 +8,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -37,16 +37,21 @@ class Workflow:
     """Runs Snakemake in a folder of its own."""
 
     folder: Path
+    profile: str = "local"
+    environment: Mapping[str, str] | None = None
 
     def command(self, *arguments: str, cores: int = 2) -> list[str]:
         base = [sys.executable, "-m", "snakemake", "--snakefile", str(ROOT / "Snakefile")]
-        profile = ["--profile", str(ROOT / "profiles" / "local"), "--cores", str(cores)]
+        profile = ["--profile", str(ROOT / "profiles" / self.profile)]
+        if self.profile == "local":
+            profile += ["--cores", str(cores)]
         return [*base, *profile, *arguments]
 
     def run(self, *arguments: str, cores: int = 2, timeout: float = 300) -> Outcome:
         done = subprocess.run(
             self.command(*arguments, cores=cores),
             cwd=self.folder,
+            env=self.environment,
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
             text=True,
@@ -54,6 +59,18 @@ class Workflow:
             check=False,
         )
         return Outcome(done.returncode, done.stdout)
+
+    def start(self, *arguments: str) -> "subprocess.Popen[str]":
+        """Start a run whose output can be read when it has ended."""
+        return subprocess.Popen(
+            self.command(*arguments),
+            cwd=self.folder,
+            env=self.environment,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            start_new_session=True,
+        )
 
     def kill_when(
         self, condition: Callable[[], bool], *arguments: str, number: int = signal.SIGKILL

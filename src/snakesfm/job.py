@@ -1,5 +1,6 @@
 """From a Snakemake job to a stage's ``run``: the log, the errors and the former file."""
 
+import contextlib
 import importlib
 import json
 import os
@@ -56,11 +57,13 @@ def run_job(stage: str) -> None:
     terminal = _redirect_to_log(call.log)
     try:
         job = _bind(call, terminal)
+        _check_inputs(job)
         module = importlib.import_module(f"snakesfm.stages.{stage}")
         started, before = time.time(), _processor_seconds()
         print(f"{_clock(started)} {stage} {job.output}", flush=True)
         module.run(job)
         _keep_former(job, module)
+        _share(job, module)
     except Exception as error:
         _fail(call, error, terminal)
     ended = time.time()
@@ -118,6 +121,7 @@ def _bind(call: Call, terminal: Any) -> Any:
         seed=params["seed"],
         threads=call.threads,
         former=former if former.is_file() else None,
+        upstream=params["upstream"],
     )
 
 
@@ -140,24 +144,53 @@ def _keep_former(job: Any, module: Any) -> None:
         print(f"warning: {former} could not be kept ({error}); a re-run computes everything anew.")
 
 
+def _check_inputs(job: Any) -> None:
+    """Refuse input files that are damaged or not of this scene and configuration."""
+    from snakesfm.artifacts.checks import check_inputs
+
+    paths = [path for name in job.inputs for path in job.paths(name)]
+    check_inputs(paths, job.scene, job.upstream)
+
+
+def _share(job: Any, module: Any) -> None:
+    """Give a finished output that other runs could take over to the folder they share, if there is one."""
+    from snakesfm.cache import VARIABLE, cached_path, share
+
+    if VARIABLE in os.environ and getattr(module, "REUSES_FORMER", False):
+        import h5py
+
+        with h5py.File(job.output, "r", locking=False) as file:
+            cached = cached_path(job.stage, file["digests"].asstr()[()])
+        if cached is not None:
+            share(job.output, cached)
+
+
 def _fail(call: Call, error: Exception, terminal: Any) -> None:
     """Say what went wrong, in the log and on the terminal, and end with exit status 1."""
     from snakesfm.errors import SnakesfmError
 
     if isinstance(error, SnakesfmError):
         sentence = str(error)
-    elif isinstance(error, OSError) and error.strerror:
-        where = f" '{error.filename}'" if error.filename else ""
-        sentence = f"{error.strerror}{where}: free the disk or correct the permission, then run again."
-        traceback.print_exc()
+    elif isinstance(error, OSError) and error.errno:
+        # h5py's errors have a number and a message of many lines
+        where = f" '{error.filename or Path(call.files['outputs'][0]).parent}'"
+        sentence = (
+            f"{os.strerror(error.errno)}{where}: free the disk or correct the permission, then run again."
+        )
+        _print_trace()
     elif isinstance(error, MemoryError):
         sentence = "Not enough memory: give the job more mem_mb, or use more blocks."
-        traceback.print_exc()
+        _print_trace()
     else:
-        traceback.print_exc()
+        _print_trace()
         sentence = f"Unexpected {type(error).__name__}: {error}; {call.log} holds the details."
-    print(f"error: {sentence}", flush=True)
-    scene = call.files["scene"]
-    print(f"snakesfm: scene '{scene}', {call.stage}: {sentence}", file=terminal, flush=True)
-    sys.stdout.flush()
-    sys.exit(1)
+    print(f"snakesfm: scene '{call.files['scene']}', {call.stage}: {sentence}", file=terminal, flush=True)
+    with contextlib.suppress(OSError):
+        print(f"error: {sentence}", flush=True)
+    # a log on a full disk must not end the process in another way
+    os._exit(1)
+
+
+def _print_trace() -> None:
+    with contextlib.suppress(OSError):
+        traceback.print_exc()

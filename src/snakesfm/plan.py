@@ -7,20 +7,23 @@ jobs is known before anything runs.
 import functools
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
 from snakesfm.config.base import StageOptions
 from snakesfm.config.configuration import STAGES, SceneInputs, list_scenes, load_configuration
 from snakesfm.config.select_pairs import SelectPairsOptions
+from snakesfm.digests import options_digest
 from snakesfm.errors import ConfigError
 from snakesfm.front_ends import FRONT_ENDS, check_methods, fetch_command, needed_weights
 from snakesfm.ingest.discover import count_images, fingerprint_images
+from snakesfm.resources import NEEDS, Load
 
-# images up to which so many blocks are used; powers of two, so that adding images rarely re-deals them
-BLOCK_LADDER = ((60, 2), (500, 4), (1_500, 8), (4_000, 16), (15_000, 32), (50_000, 64))
-MOST_BLOCKS = 128
+# images up to which so many blocks are used: few steps, so that adding images rarely re-deals them, and so
+# few blocks that a tile takes about half a minute at the upper end of a step (docs/cluster.md)
+BLOCK_LADDER = ((60, 2), (1_000, 4), (4_000, 8), (16_000, 16), (60_000, 32))
+MOST_BLOCKS = 48
 
 SCENE_ARTIFACTS = (
     "index_images/index.h5",
@@ -207,6 +210,31 @@ class ScenePlan:
         """The global descriptors of all blocks where pairs are retrieved, else nothing."""
         return self.files("describe_images", "blocks") if self.select_pairs.needs_descriptors else []
 
+    @functools.cached_property
+    def pair_count(self) -> int:
+        """Most pairs that will be chosen, as far as is known before anything runs."""
+        options, images = self.select_pairs, self.image_count
+        everything = images * (images - 1) // 2
+        if options.method == "exhaustive":
+            return everything
+        if options.method == "listed":
+            lines = Path(self.inputs.pairs).expanduser().read_text("utf-8", errors="replace").splitlines()
+            return min(len(lines), everything)
+        # a similar image is mostly found from one side alone
+        per_image = options.look_ahead * ("sequential" in options.method)
+        per_image += int(options.top_k) * options.needs_descriptors
+        return min(images * per_image, everything)
+
+    def load(self, stage: str) -> Load:
+        """What one job of a stage works on, on average over the blocks or tiles."""
+        grain = NEEDS[stage].grain
+        tiles = self.blocks * (self.blocks + 1) / 2
+        if grain == "block":
+            return Load(self.image_count / self.blocks, 0)
+        if grain == "tile":
+            return Load(min(2 / self.blocks, 1) * self.image_count, self.pair_count / tiles)
+        return Load(self.image_count, self.pair_count)
+
     def final_files(self) -> list[str]:
         """What a person looks at: the scene's model, its metrics and its report."""
         names = ("export_model/summary.json", "evaluate_model/metrics.json", "render_report/index.html")
@@ -269,16 +297,36 @@ class ScenePlan:
             return {"reference": inputs.reference, "reference_content": _file_digest(inputs.reference)}
         return {}
 
-    def params(self, stage: str, wildcards: Mapping[str, str], main_process: bool) -> str:
-        """All that determines a job's result beside its input files, as one canonical JSON string."""
+    def params(
+        self, stage: str, wildcards: Mapping[str, str], inputs: Iterable[str], main_process: bool
+    ) -> str:
+        """All that determines a job's result beside its input files, as one canonical JSON string.
+
+        The versions and options of the stages that made the input files are part of it, so that the job can
+        check what it is given.
+        """
         options = self.options(stage)
         content = {
             "options": json.loads(options.canonical_json()),
             "stage_version": options.stage_version,
             "settings": self.settings(stage, wildcards, main_process),
             "seed": self.configuration.seed,
+            "upstream": self._upstream(inputs),
         }
         return json.dumps(content, sort_keys=True)
+
+    def _upstream(self, inputs: Iterable[str]) -> dict[str, str]:
+        """The options digest of every stage that made one of these files."""
+        stages = {part for path in inputs for part in Path(path).parent.parts[-3:] if part in STAGES}
+        return {stage: self._options_digests[stage] for stage in sorted(stages)}
+
+    @functools.cached_property
+    def _options_digests(self) -> dict[str, str]:
+        options = {stage: self.options(stage) for stage in STAGES}
+        return {
+            stage: options_digest(value.stage_version, value.canonical_json())
+            for stage, value in options.items()
+        }
 
 
 def _check_writable(folder: Path) -> None:

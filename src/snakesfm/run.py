@@ -4,15 +4,19 @@ import contextlib
 import fcntl
 import json
 import os
+import re
+import subprocess
 import threading
 import time
 from pathlib import Path
 from typing import Any
 
+from snakesfm import slurm
 from snakesfm.errors import ConfigError
 from snakesfm.plan import Plan, ScenePlan
 
 LOCK_NAME = ".snakesfm.lock"
+MOST_SENTENCES = 10
 
 
 class Run:
@@ -22,13 +26,20 @@ class Run:
         self.plan = plan
         self.started = time.time()
         self.lock: Any = None
+        self.slurm_run = ""
 
-    def start(self) -> None:
+    def start(self, slurm_run: str = "") -> None:
         """Take the output folder for this run; the system frees it when the run ends, however it ends.
+
+        Parameters
+        ----------
+        slurm_run : the name of this run's SLURM jobs; they outlive a run that is killed, so the next run
+            reads it in the lock file and cancels them. Empty without SLURM.
 
         Raises
         ------
-        ConfigError : another run is writing to the folder, or the folder cannot be written.
+        ConfigError : another run is writing to the folder, or the folder cannot be written, or SLURM jobs
+            of an interrupted run cannot be ended.
         """
         path = self.plan.output / LOCK_NAME
         try:
@@ -49,9 +60,11 @@ class Run:
             ) from None
         except OSError as error:
             print(f"snakesfm: warning: {path} cannot be locked ({error.strerror}); start one run only.")
-        self.lock.truncate(0)
-        self.lock.write(f"process {os.getpid()} on {os.uname().nodename}\n")
-        self.lock.flush()
+        self._end_former_jobs()
+        self.slurm_run = slurm_run
+        jobs = f", SLURM run {slurm_run}" if slurm_run else ""
+        self._note(f"process {os.getpid()} on {os.uname().nodename}{jobs}")
+        self._bring_times_back()
         for scene in self.plan.scenes.values():
             print(
                 f"snakesfm: scene '{scene.name}': {scene.image_count} image files in {scene.images}, "
@@ -59,20 +72,63 @@ class Run:
                 flush=True,
             )
 
+    def _note(self, text: str) -> None:
+        """Say in the lock file who holds it."""
+        self.lock.truncate(0)
+        self.lock.write(f"{text}\n" if text else "")
+        self.lock.flush()
+
+    def _end_former_jobs(self) -> None:
+        """Cancel what an interrupted run has left in SLURM's queue."""
+        self.lock.seek(0)
+        former = re.search(r"SLURM run (\S+)", self.lock.read())
+        if former:
+            count = slurm.end_jobs(former[1], str(self.plan.output), self.lock.name)
+            if count:
+                print(f"snakesfm: {count} SLURM jobs of an interrupted run were cancelled.", flush=True)
+
+    def _bring_times_back(self) -> None:
+        """Give files from the future, which a wrong clock made, the present time, in their order.
+
+        Snakemake refuses the result of a job that looks older than what the job read.
+        """
+        now = time.time_ns()
+        times = {}
+        for scene in self.plan.scenes.values():
+            for file in scene.all_files():
+                with contextlib.suppress(OSError):
+                    times[file] = Path(file).stat().st_mtime_ns
+        future = sorted((file for file in times if times[file] > now), key=lambda file: (times[file], file))
+        for place, file in enumerate(future):
+            changed = now - 1_000_000 * (len(future) - place)
+            os.utime(file, ns=(changed, changed))
+        if future:
+            print(
+                f"snakesfm: warning: {len(future)} files are from the future: a clock is or was wrong.",
+                flush=True,
+            )
+
     def finish(self) -> None:
         """One line per scene about its model."""
         _cancel_timers()
+        self._note("")
         for scene in self.plan.scenes.values():
             print(self.describe(scene), flush=True)
 
     def fail(self) -> None:
         """One line per scene: its model where it has one, else the sentences of its failed jobs."""
         _cancel_timers()
+        with contextlib.suppress(OSError, subprocess.SubprocessError):
+            if not self.slurm_run or not slurm.list_jobs(self.slurm_run):
+                self._note("")
         for scene in self.plan.scenes.values():
             sentences = self.failures(scene)
             if sentences:
-                for sentence in sentences:
+                for sentence in sentences[:MOST_SENTENCES]:
                     print(f"snakesfm: scene '{scene.name}' failed: {sentence}", flush=True)
+                if len(sentences) > MOST_SENTENCES:
+                    more = len(sentences) - MOST_SENTENCES
+                    print(f"snakesfm: scene '{scene.name}' failed: {more} more jobs.", flush=True)
             elif all(Path(file).is_file() for file in scene.final_files()):
                 print(self.describe(scene), flush=True)
             else:
@@ -90,6 +146,11 @@ class Run:
             lines = log.read_text("utf-8", errors="replace").splitlines()
             if lines and lines[-1].startswith("error: "):
                 sentences.append(f"{lines[-1].removeprefix('error: ')} (log: {log})")
+            elif lines and " done in " not in lines[-1]:
+                sentences.append(
+                    f"{log.parent.name} {log.stem} was ended from outside, for its memory or time, by "
+                    f"a person or with its node (log: {log})"
+                )
         return sentences
 
     def describe(self, scene: ScenePlan) -> str:

@@ -148,8 +148,12 @@ def test_a_killed_run_ends_with_the_same_model_when_started_again(
     assert not list(output.rglob("*.tmp"))
 
 
-def test_blocks_cores_and_order_do_not_change_the_model(finished, small_scene: Path, workflow) -> None:
-    outcome = workflow.run(*config_of(small_scene), "blocks=3", cores=1)
+@pytest.mark.parametrize(("blocks", "cores"), [(3, 1), (5, 8)])
+def test_blocks_cores_and_order_do_not_change_the_model(
+    finished, small_scene: Path, workflow, blocks: int, cores: int
+) -> None:
+    """The undisturbed run has 2 blocks and 2 jobs at once."""
+    outcome = workflow.run(*config_of(small_scene), f"blocks={blocks}", cores=cores)
     assert outcome.status == 0, outcome.text
     first = Reconstruction.read(finished[0] / "adjust_bundle" / "reconstruction.h5")
     second = Reconstruction.read(workflow.folder / "out" / "square" / "adjust_bundle" / "reconstruction.h5")

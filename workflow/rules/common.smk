@@ -8,6 +8,7 @@ import sys
 from snakemake.exceptions import WorkflowError
 from snakemake.settings.types import DeploymentMethod
 
+from snakesfm import resources
 from snakesfm.errors import SnakesfmError
 from snakesfm.plan import Plan, tile_names
 from snakesfm.run import Run
@@ -78,9 +79,9 @@ def any_of(names):
 def job_params(stage):
     """A params function: the canonical JSON of all that determines a job's result beside its inputs."""
 
-    def render(wildcards):
+    def render(wildcards, input):
         scene = PLAN.scenes[wildcards.scene]
-        return scene.params(stage, wildcards, workflow.is_main_process)
+        return scene.params(stage, wildcards, input, workflow.is_main_process)
 
     return render
 
@@ -123,6 +124,33 @@ def job_command(stage):
     return f"{command} <<'END OF JOB'\n{{params.job}}\n{{params.files}}\n{{threads}}\n{{log}}\nEND OF JOB\n"
 
 
+def memory_mb(stage):
+    """A resource function: the memory that a job asks a cluster for."""
+
+    def compute(wildcards, attempt):
+        # only the controller submits jobs, so only it needs the number of images
+        if not workflow.is_main_process:
+            return 1
+        return resources.memory_mb(
+            stage, PLAN.scenes[wildcards.scene].load(stage), attempt
+        )
+
+    return compute
+
+
+def runtime_min(stage):
+    """A resource function: the minutes that a job asks a cluster for."""
+
+    def compute(wildcards, attempt):
+        if not workflow.is_main_process:
+            return 1
+        return resources.runtime_min(
+            stage, PLAN.scenes[wildcards.scene].load(stage), attempt
+        )
+
+    return compute
+
+
 def all_files():
     """What a run makes of all scenes."""
     return [path for scene in PLAN.scenes.values() for path in scene.all_files()]
@@ -140,8 +168,10 @@ def all_hloc_files():
 
 def start_run():
     """Lock the output folder for this run, and say what is about to be done."""
+    # the SLURM executor names all jobs of a run alike
+    executor = getattr(workflow.scheduler, "_executor", None)
     try:
-        RUN.start()
+        RUN.start(getattr(executor, "run_uuid", ""))
     except SnakesfmError as error:
         raise WorkflowError(str(error)) from None
 

@@ -14,6 +14,9 @@ rule export_database:
         log_file("export_database"),
     benchmark:
         benchmark_file("export_database")
+    resources:
+        mem_mb=memory_mb("export_database"),
+        runtime=runtime_min("export_database"),
     params:
         job=job_params("export_database"),
         files=job_files(),
@@ -69,6 +72,9 @@ rule export_model:
         log_file("export_model"),
     benchmark:
         benchmark_file("export_model")
+    resources:
+        mem_mb=memory_mb("export_model"),
+        runtime=runtime_min("export_model"),
     params:
         job=job_params("export_model"),
         files=job_files(),
@@ -87,6 +93,9 @@ rule evaluate_model:
         log_file("evaluate_model"),
     benchmark:
         benchmark_file("evaluate_model")
+    resources:
+        mem_mb=memory_mb("evaluate_model"),
+        runtime=runtime_min("evaluate_model"),
     params:
         job=job_params("evaluate_model"),
         files=job_files(),

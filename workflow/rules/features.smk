@@ -12,6 +12,8 @@ rule extract_features:
         benchmark_file("extract_features", "{block}")
     resources:
         gpu=gpus("extract_features"),
+        mem_mb=memory_mb("extract_features"),
+        runtime=runtime_min("extract_features"),
     params:
         job=job_params("extract_features"),
         files=job_files(),
@@ -28,6 +30,9 @@ rule learn_vocabulary:
         log_file("learn_vocabulary"),
     benchmark:
         benchmark_file("learn_vocabulary")
+    resources:
+        mem_mb=memory_mb("learn_vocabulary"),
+        runtime=runtime_min("learn_vocabulary"),
     params:
         job=job_params("learn_vocabulary"),
         files=job_files(),
@@ -45,6 +50,9 @@ rule describe_images:
         log_file("describe_images", "{block}"),
     benchmark:
         benchmark_file("describe_images", "{block}")
+    resources:
+        mem_mb=memory_mb("describe_images"),
+        runtime=runtime_min("describe_images"),
     params:
         job=job_params("describe_images"),
         files=job_files(),
@@ -69,6 +77,9 @@ for blocks, scenes in PLAN.scenes_by_blocks().items():
             benchmark_file("select_pairs")
         wildcard_constraints:
             scene=any_of(scenes),
+        resources:
+            mem_mb=memory_mb("select_pairs"),
+            runtime=runtime_min("select_pairs"),
         params:
             job=job_params("select_pairs"),
             files=job_files(),

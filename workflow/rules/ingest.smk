@@ -9,6 +9,9 @@ rule index_images:
     benchmark:
         benchmark_file("index_images")
     threads: 2
+    resources:
+        mem_mb=memory_mb("index_images"),
+        runtime=runtime_min("index_images"),
     params:
         job=job_params("index_images"),
         files=job_files(),

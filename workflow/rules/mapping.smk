@@ -11,6 +11,9 @@ rule build_view_graph:
         log_file("build_view_graph"),
     benchmark:
         benchmark_file("build_view_graph")
+    resources:
+        mem_mb=memory_mb("build_view_graph"),
+        runtime=runtime_min("build_view_graph"),
     params:
         job=job_params("build_view_graph"),
         files=job_files(),
@@ -28,6 +31,9 @@ rule filter_view_graph:
         log_file("filter_view_graph"),
     benchmark:
         benchmark_file("filter_view_graph")
+    resources:
+        mem_mb=memory_mb("filter_view_graph"),
+        runtime=runtime_min("filter_view_graph"),
     params:
         job=job_params("filter_view_graph"),
         files=job_files(),
@@ -45,6 +51,9 @@ rule average_rotations:
         log_file("average_rotations"),
     benchmark:
         benchmark_file("average_rotations")
+    resources:
+        mem_mb=memory_mb("average_rotations"),
+        runtime=runtime_min("average_rotations"),
     params:
         job=job_params("average_rotations"),
         files=job_files(),
@@ -65,6 +74,9 @@ rule build_tracks:
         log_file("build_tracks"),
     benchmark:
         benchmark_file("build_tracks")
+    resources:
+        mem_mb=memory_mb("build_tracks"),
+        runtime=runtime_min("build_tracks"),
     params:
         job=job_params("build_tracks"),
         files=job_files(),
@@ -85,6 +97,9 @@ rule average_translations:
         log_file("average_translations"),
     benchmark:
         benchmark_file("average_translations")
+    resources:
+        mem_mb=memory_mb("average_translations"),
+        runtime=runtime_min("average_translations"),
     params:
         job=job_params("average_translations"),
         files=job_files(),
@@ -105,6 +120,9 @@ rule triangulate_tracks:
         log_file("triangulate_tracks"),
     benchmark:
         benchmark_file("triangulate_tracks")
+    resources:
+        mem_mb=memory_mb("triangulate_tracks"),
+        runtime=runtime_min("triangulate_tracks"),
     params:
         job=job_params("triangulate_tracks"),
         files=job_files(),
@@ -128,6 +146,9 @@ rule adjust_bundle:
         log_file("adjust_bundle"),
     benchmark:
         benchmark_file("adjust_bundle")
+    resources:
+        mem_mb=memory_mb("adjust_bundle"),
+        runtime=runtime_min("adjust_bundle"),
     params:
         job=job_params("adjust_bundle"),
         files=job_files(),

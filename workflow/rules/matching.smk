@@ -13,6 +13,8 @@ rule match_pairs:
         benchmark_file("match_pairs", "{tile}")
     resources:
         gpu=gpus("match_pairs"),
+        mem_mb=memory_mb("match_pairs"),
+        runtime=runtime_min("match_pairs"),
     params:
         job=job_params("match_pairs"),
         files=job_files(),
@@ -31,6 +33,9 @@ rule calibrate_cameras:
         log_file("calibrate_cameras"),
     benchmark:
         benchmark_file("calibrate_cameras")
+    resources:
+        mem_mb=memory_mb("calibrate_cameras"),
+        runtime=runtime_min("calibrate_cameras"),
     params:
         job=job_params("calibrate_cameras"),
         files=job_files(),
@@ -50,6 +55,9 @@ rule estimate_two_view:
         log_file("estimate_two_view", "{tile}"),
     benchmark:
         benchmark_file("estimate_two_view", "{tile}")
+    resources:
+        mem_mb=memory_mb("estimate_two_view"),
+        runtime=runtime_min("estimate_two_view"),
     params:
         job=job_params("estimate_two_view"),
         files=job_files(),

@@ -18,6 +18,9 @@ rule render_report:
         log_file("render_report"),
     benchmark:
         benchmark_file("render_report")
+    resources:
+        mem_mb=memory_mb("render_report"),
+        runtime=runtime_min("render_report"),
     params:
         job=job_params("render_report"),
         files=job_files(),

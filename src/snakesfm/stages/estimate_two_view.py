@@ -38,38 +38,39 @@ def run(job: StageJob) -> None:
     matches = PairMatches.read(job.path("matches"))
     keypoints, image_digests = _read_keypoints(job.paths("features"), set(matches.pairs.ravel().tolist()))
     places = {image: first_rows_at_place(points) for image, points in keypoints.items()}
-    former = _read_former(job.former)
-    progress = job.progress(len(matches.pairs), "pairs")
+    for image in set(matches.pairs.ravel().tolist()) - keypoints.keys():
+        raise ArtifactError(
+            f"{job.path('matches')} names image {index.names[image]}, which no features file "
+            "holds: delete both and run again."
+        )
+    pairs: list[tuple[int, int]] = [(int(i), int(j)) for i, j in matches.pairs]
+    cameras_of = [(of_camera[index.camera_ids[i]], of_camera[index.camera_ids[j]]) for i, j in pairs]
+    seeds = [job.seed_for(str(index.names[i]), str(index.names[j])) for i, j in pairs]
+    digests = [
+        _digest(
+            _best_first(matches, k), (image_digests[i], image_digests[j]), cameras_of[k], options, seeds[k]
+        )
+        for k, (i, j) in enumerate(pairs)
+    ]
+    former = job.take_over(digests, _read_former)
+    progress = job.progress(len(pairs), "pairs")
     rows: list[Row] = []
     reused = 0
-    for k, (i, j) in enumerate(matches.pairs.tolist()):
-        for image in (i, j):
-            if image not in keypoints:
-                raise ArtifactError(
-                    f"{job.path('matches')} names image {index.names[image]}, which no features file "
-                    "holds: delete both and run again."
-                )
-        pair_matches = _best_first(matches, k)
-        camera_i, camera_j = (of_camera[index.camera_ids[image]] for image in (i, j))
-        seed = job.seed_for(str(index.names[i]), str(index.names[j]))
-        digest = _digest(
-            pair_matches, (image_digests[i], image_digests[j]), (camera_i, camera_j), options, seed
-        )
-        row = former.get(digest)
+    for k, (i, j) in enumerate(pairs):
+        row = former.get(digests[k])
         if row is None:
             estimate = estimate_two_view_geometry(
                 keypoints[i],
                 keypoints[j],
-                unify_matches(places[i], places[j], pair_matches),
-                camera_i,
-                camera_j,
+                unify_matches(places[i], places[j], _best_first(matches, k)),
+                *cameras_of[k],
                 options,
-                seed,
+                seeds[k],
             )
             row = _to_row(estimate)
         else:
             reused += 1
-        rows.append(row | {"digests": digest})
+        rows.append(row | {"digests": digests[k]})
         progress.step()
     _assemble(matches.pairs, rows).write(job.output, job.header)
     print(_summary(rows, reused), flush=True)
@@ -145,13 +146,15 @@ COLUMNS: dict[str, tuple[tuple[int, ...], str]] = {
 }
 
 
-def _read_former(path: Path | None) -> dict[str, Row]:
-    """Results of an earlier run by their digest; nothing where it cannot be read."""
+def _read_former(path: Path, wanted: set[str]) -> dict[str, Row]:
+    """The wanted results of an earlier run by their digest; nothing where it cannot be read."""
     former = TwoViewGeometries.read_former(path)
     if former is None:
         return {}
     rows: dict[str, Row] = {}
     for k, digest in enumerate(former.digests):
+        if digest not in wanted:
+            continue
         row: Row = {name: getattr(former, name)[k] for name in COLUMNS}
         row["inliers"] = former.inliers[former.offsets[k] : former.offsets[k + 1]]
         rows[str(digest)] = row

@@ -49,7 +49,7 @@ def run(job: StageJob) -> None:
     finder = _create_finder(job, options)
     beside = job.weights_digest() + str(job.settings.get("source_content", ""))
     digests = [_digest(str(index.sha256[row]), options, beside) for row in rows]
-    former = _read_former(job.former, set(digests))
+    former = job.take_over(digests, _read_former)
     progress = job.progress(len(rows), "images")
     results = []
     for row, digest in zip(rows, digests, strict=True):
@@ -148,7 +148,7 @@ def _extract(
     return ColoredKeypoints(points.scaled(image.reduction, image.reduction), colors)
 
 
-def _read_former(path: Path | None, wanted: set[str]) -> Mapping[str, ColoredKeypoints]:
+def _read_former(path: Path, wanted: set[str]) -> Mapping[str, ColoredKeypoints]:
     """What an earlier file holds of the images that are unchanged, by digest."""
     former = LocalFeatures.read_former(path)
     if former is None:

@@ -3,12 +3,13 @@
 import json
 import sys
 import time
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TextIO
 
 from snakesfm.artifacts.base import Header
+from snakesfm.cache import cached_path
 from snakesfm.seeding import derive_seed
 
 
@@ -60,6 +61,7 @@ class StageJob:
     seed : the run's seed.
     threads : how many threads may be used; results never depend on it.
     former : an earlier version of the output whose unchanged parts may be taken over, or None.
+    upstream : per stage whose artifacts are read the digest of its version and options.
     """
 
     stage: str
@@ -71,6 +73,7 @@ class StageJob:
     seed: int = 0
     threads: int = 1
     former: Path | None = None
+    upstream: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def output(self) -> Path:
@@ -118,6 +121,23 @@ class StageJob:
         from snakesfm.learned.weights import weights_digest
 
         return weights_digest(models, Path(self.settings["weights"]))
+
+    def take_over(
+        self, digests: Sequence[str], read: Callable[[Path, set[str]], Mapping[str, Any]]
+    ) -> dict[str, Any]:
+        """Results of unchanged images or pairs, from the former file and the folder that runs share.
+
+        Parameters
+        ----------
+        digests : of all images or pairs of the output, in its order.
+        read : reads what a file holds of the wanted digests, nothing where it cannot be read.
+        """
+        wanted = set(digests)
+        taken: dict[str, Any] = {}
+        for path in (self.former, cached_path(self.stage, digests)):
+            if path is not None and path.is_file() and not wanted <= taken.keys():
+                taken.update(read(path, wanted))
+        return taken
 
     def progress(self, total: int, what: str) -> "Progress":
         """A counter that prints how far the job is, at most every five seconds."""

@@ -46,7 +46,7 @@ def run(job: StageJob) -> None:
         digests = [
             _digest(features.digests[i], features.digests[j], options, beside) for i, j in pairs.tolist()
         ]
-        former = _read_former(job.former, set(digests))
+        former = job.take_over(digests, _read_former)
         results = {row: former[digest] for row, digest in enumerate(digests) if digest in former}
         reused = len(results)
         progress = job.progress(len(pairs) - reused, "pairs")
@@ -153,7 +153,7 @@ def _digest(first: str, second: str, options: "MatchPairsOptions", beside: str) 
     return hashlib.sha256(text.encode()).hexdigest()
 
 
-def _read_former(path: Path | None, wanted: set[str]) -> Mapping[str, Matches]:
+def _read_former(path: Path, wanted: set[str]) -> Mapping[str, Matches]:
     """What an earlier file holds of the pairs that are unchanged, by digest."""
     former = PairMatches.read_former(path)
     if former is None:

@@ -1,0 +1,54 @@
+"""Are the files that a job is about to read what the configuration says they are?"""
+
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+
+from snakesfm.artifacts.base import read_header
+from snakesfm.digests import options_digest
+from snakesfm.errors import ArtifactError
+
+ASIDE = ".refused"
+
+
+def check_inputs(paths: Iterable[Path], scene: str, digests: Mapping[str, str]) -> None:
+    """Set aside every artifact that is damaged or not of this scene and configuration.
+
+    Snakemake sees that a file is there and how old it is, not what it holds. A file that was set aside is
+    missing, so the next run makes it again.
+
+    Parameters
+    ----------
+    paths : files to look at; only their headers are read, and what is no HDF5 file is left alone.
+    scene : the scene that they must be of.
+    digests : options digest by stage.
+
+    Raises
+    ------
+    ArtifactError : at least one file was set aside.
+    """
+    refused = []
+    for path in paths:
+        reason = _reason(path, scene, digests) if path.suffix == ".h5" and path.is_file() else ""
+        if reason:
+            path.replace(path.with_name(path.name + ASIDE))
+            refused.append(f"{path} {reason}")
+    if refused:
+        more = f" (and {len(refused) - 1} more)" if len(refused) > 1 else ""
+        raise ArtifactError(
+            f"{refused[0]}{more}: it was renamed to *{ASIDE}; start the same command again to make it anew."
+        )
+
+
+def _reason(path: Path, scene: str, digests: Mapping[str, str]) -> str:
+    """Why a file cannot be used; empty where it can be."""
+    header = read_header(path)
+    if not header:
+        return "is damaged"
+    stage = str(header.get("stage"))
+    if stage not in digests:
+        return f"is of stage '{stage}'"
+    if header.get("scene") != scene:
+        return f"is of scene '{header.get('scene')}'"
+    if options_digest(header.get("stage_version", 0), str(header.get("options"))) != digests[stage]:
+        return f"is of another version or other options of {stage}"
+    return ""

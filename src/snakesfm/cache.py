@@ -1,0 +1,50 @@
+"""Results that several runs share: a folder of artifacts, named by the digest of all that they depend on.
+
+A stage that takes unchanged images or pairs from its former file takes them from here as well. Every image
+or pair is compared by its own digest again, so a wrong or damaged file costs time and never a result.
+"""
+
+import contextlib
+import hashlib
+import os
+import shutil
+from collections.abc import Iterable
+from pathlib import Path
+
+VARIABLE = "SNAKESFM_CACHE"
+
+
+def cached_path(stage: str, digests: Iterable[str]) -> Path | None:
+    """Where the shared folder keeps a stage's file of these images or pairs; None without such a folder.
+
+    Parameters
+    ----------
+    stage : verb_noun name of the stage.
+    digests : per image or pair of the file the digest of all that its result depends on.
+    """
+    folder = os.environ.get(VARIABLE)
+    if not folder:
+        return None
+    name = hashlib.sha256("\n".join((stage, *digests)).encode()).hexdigest()
+    return Path(folder).expanduser() / stage / name[:2] / f"{name}.h5"
+
+
+def share(path: Path, cached: Path) -> None:
+    """Put a finished file into the shared folder, complete or not at all; a link where that is possible."""
+    try:
+        if cached.exists() and cached.stat().st_size == path.stat().st_size:
+            return
+        cached.parent.mkdir(parents=True, exist_ok=True)
+        temporary = cached.with_name(f".{cached.name}.{os.uname().nodename}.{os.getpid()}")
+        try:
+            with contextlib.suppress(FileNotFoundError):
+                temporary.unlink()
+            try:
+                os.link(path, temporary)
+            except OSError:
+                shutil.copyfile(path, temporary)
+            temporary.replace(cached)
+        finally:
+            temporary.unlink(missing_ok=True)
+    except OSError as error:
+        print(f"warning: {cached} could not be shared ({error}); correct {VARIABLE} or unset it.")

@@ -1,0 +1,82 @@
+"""What a job needs, as a cluster's scheduler wants to know it before the job starts: memory and time.
+
+Needs are straight lines above measured jobs (docs/cluster.md), in what a job works on, its images and
+pairs. They never reach a stage, so they cannot change a result.
+"""
+
+import math
+from dataclasses import dataclass
+
+# the two Snakemake processes that stand around a job on a cluster's node, 130 MB each
+AROUND_MB = 300
+# a busy file system and a slow start take minutes without any work
+START_MIN = 15
+
+
+@dataclass(frozen=True)
+class Load:
+    """What one job works on.
+
+    Parameters
+    ----------
+    images, pairs : number of images and of pairs of images.
+    """
+
+    images: float
+    pairs: float
+
+
+@dataclass(frozen=True)
+class Need:
+    """What a stage's job asks for: about twice what was measured, for images of 5,000 keypoints.
+
+    Parameters
+    ----------
+    grain : 'block', 'tile' or 'scene': what one job is of.
+    constant_mb, image_mb, pair_mb : memory of the stage whatever it works on, per image, and per pair.
+    image_s, pair_s : seconds per image and per pair.
+    """
+
+    grain: str
+    constant_mb: float
+    image_mb: float = 0.0
+    pair_mb: float = 0.0
+    image_s: float = 0.0
+    pair_s: float = 0.0
+
+
+NEEDS = {
+    "index_images": Need("scene", 500, 0.02, image_s=0.12),
+    "extract_features": Need("block", 1500, 2.0, image_s=1.8),
+    "learn_vocabulary": Need("scene", 1000, 0.01, image_s=0.1),
+    "describe_images": Need("block", 500, 0.2, image_s=0.3),
+    "select_pairs": Need("scene", 500, 0.1, 0.0005, image_s=0.2),
+    "match_pairs": Need("tile", 400, 0.02, 0.03, pair_s=0.12),
+    "calibrate_cameras": Need("scene", 500, 0.1, 0.0005, image_s=0.12),
+    "estimate_two_view": Need("tile", 500, 0.2, 0.03, pair_s=0.12),
+    "build_view_graph": Need("scene", 300, 0.01, 0.002, image_s=0.06),
+    "filter_view_graph": Need("scene", 800, 0.02, 0.002, image_s=0.12),
+    "average_rotations": Need("scene", 600, 0.05, 0.01, image_s=0.25),
+    "build_tracks": Need("scene", 400, 1.2, 0.02, image_s=0.2),
+    "average_translations": Need("scene", 600, 1.6, image_s=1.2),
+    "triangulate_tracks": Need("scene", 600, 1.6, image_s=0.25),
+    "adjust_bundle": Need("scene", 800, 4.5, 0.01, image_s=2.4),
+    "export_database": Need("scene", 600, 1.0, 0.03, image_s=0.1, pair_s=0.01),
+    "export_model": Need("scene", 600, 1.6, image_s=0.2),
+    "evaluate_model": Need("scene", 800, 0.2, image_s=0.06),
+    "render_report": Need("scene", 600, 0.5, image_s=0.06),
+}
+
+
+def memory_mb(stage: str, load: Load, attempt: int = 1) -> int:
+    """Megabytes that a stage's job asks for; each further attempt asks for twice as much."""
+    need = NEEDS[stage]
+    own = need.constant_mb + need.image_mb * load.images + need.pair_mb * load.pairs
+    return 100 * math.ceil((AROUND_MB + own) / 100) << (attempt - 1)
+
+
+def runtime_min(stage: str, load: Load, attempt: int = 1) -> int:
+    """Minutes that a stage's job asks for; each further attempt asks for twice as much."""
+    need = NEEDS[stage]
+    seconds = need.image_s * load.images + need.pair_s * load.pairs
+    return (START_MIN + math.ceil(seconds / 60)) << (attempt - 1)

@@ -1,0 +1,71 @@
+"""Files that a job must not read: they are set aside with one sentence."""
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from snakesfm.artifacts import Header, ImagePairs
+from snakesfm.artifacts.checks import check_inputs
+from snakesfm.digests import options_digest
+from snakesfm.errors import ArtifactError
+
+DIGESTS = {"select_pairs": options_digest(3, '{"a": 1}')}
+
+
+def write_pairs(
+    path: Path, stage: str = "select_pairs", version: int = 3, scene: str = "s", options: str = '{"a": 1}'
+) -> Path:
+    pairs = ImagePairs(
+        pairs=np.array([[0, 1]]), reasons=np.array(["listed"], object), similarities=np.array([0.5])
+    )
+    pairs.write(path, Header(stage, version, scene, options))
+    return path
+
+
+def truncate(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[:-300])
+
+
+def test_a_file_of_this_scene_and_configuration_is_left_alone(tmp_path: Path) -> None:
+    path = write_pairs(tmp_path / "0-0.h5")
+    before = path.read_bytes()
+    check_inputs([path, tmp_path / "missing.h5", tmp_path / "other.json"], "s", DIGESTS)
+    assert path.read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    ("damage", "reason"),
+    [
+        (truncate, "is damaged"),
+        (lambda path: path.write_bytes(b""), "is damaged"),
+        (lambda path: path.write_bytes(b"\0" * 5000), "is damaged"),
+        (lambda path: write_pairs(path, version=2), "another version"),
+        (lambda path: write_pairs(path, options='{"a": 2}'), "other options"),
+        (lambda path: write_pairs(path, scene="t"), "is of scene 't'"),
+        (lambda path: write_pairs(path, stage="match_pairs"), "is of stage 'match_pairs'"),
+    ],
+)
+def test_any_other_file_is_set_aside(tmp_path: Path, damage: Callable[[Path], None], reason: str) -> None:
+    good, bad = write_pairs(tmp_path / "0-0.h5"), write_pairs(tmp_path / "0-1.h5")
+    damage(bad)
+    content = bad.read_bytes()
+    with pytest.raises(ArtifactError, match=reason) as caught:
+        check_inputs([good, bad], "s", DIGESTS)
+    assert str(bad) in str(caught.value)
+    assert "start the same command again" in str(caught.value)
+    assert good.is_file()
+    assert not bad.exists()
+    assert (tmp_path / "0-1.h5.refused").read_bytes() == content
+
+
+def test_one_sentence_for_several_files(tmp_path: Path) -> None:
+    first = write_pairs(tmp_path / "0-0.h5", scene="t")
+    second = tmp_path / "0-1.h5"
+    shutil.copy(first, second)
+    with pytest.raises(ArtifactError, match="and 1 more"):
+        check_inputs([first, second], "s", DIGESTS)
+    assert not first.exists()
+    assert not second.exists()

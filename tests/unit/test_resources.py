@@ -1,0 +1,36 @@
+"""What jobs ask a cluster for."""
+
+from pathlib import Path
+
+import pytest
+
+from snakesfm.config.configuration import STAGES
+from snakesfm.resources import NEEDS, Load, memory_mb, runtime_min
+
+
+def test_every_stage_has_a_need() -> None:
+    assert set(NEEDS) == set(STAGES)
+
+
+@pytest.mark.parametrize("stage", STAGES)
+def test_more_work_and_further_attempts_never_ask_for_less(stage: str) -> None:
+    small, large = Load(10, 45), Load(5_000, 100_000)
+    for ask in (memory_mb, runtime_min):
+        assert 0 < ask(stage, small) <= ask(stage, large)
+        assert ask(stage, large, 2) == 2 * ask(stage, large)
+        assert ask(stage, large, 3) == 4 * ask(stage, large)
+
+
+@pytest.mark.parametrize("stage", STAGES)
+def test_small_scenes_fit_a_laptop_and_large_ones_a_node(stage: str) -> None:
+    assert 500 <= memory_mb(stage, Load(50, 1225)) <= 3_000
+    assert memory_mb(stage, Load(10_000, 120_000)) <= 100_000
+    assert 15 <= runtime_min(stage, Load(50, 1225)) <= 30
+
+
+@pytest.mark.parametrize("stage", STAGES)
+def test_the_page_on_clusters_names_the_needs(root: Path, stage: str) -> None:
+    need = NEEDS[stage]
+    numbers = (need.constant_mb, need.image_mb, need.pair_mb, need.image_s, need.pair_s)
+    row = f"| `{stage}` | {need.grain} | " + " | ".join(f"{number:g}" for number in numbers) + " |"
+    assert row in (root / "docs" / "cluster.md").read_text()

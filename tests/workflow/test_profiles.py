@@ -1,0 +1,71 @@
+"""The profiles: what they plan, and that they differ only where they say so."""
+
+import re
+from pathlib import Path
+
+import pytest
+import yaml
+from workflow_runner import Workflow
+
+pytestmark = pytest.mark.workflow
+
+CLUSTERS = ("slurm", "slurm-gpu", "kubernetes")
+
+
+def read_profile(root: Path, name: str) -> dict:
+    return yaml.safe_load((root / "profiles" / name / "profile.yaml").read_text())
+
+
+def test_a_gpu_is_all_that_slurm_gpu_adds_to_slurm(root: Path) -> None:
+    plain, gpu = read_profile(root, "slurm"), read_profile(root, "slurm-gpu")
+    assert gpu.pop("set-resources") == {"extract_features": {"gpu": 1}, "match_pairs": {"gpu": 1}}
+    assert gpu == plain
+
+
+@pytest.mark.parametrize("name", CLUSTERS)
+def test_a_cluster_runs_jobs_by_the_same_rules_as_a_laptop(root: Path, name: str) -> None:
+    local, cluster = read_profile(root, "local"), read_profile(root, name)
+    for key in (
+        "keep-going",
+        "nolock",
+        "rerun-incomplete",
+        "rerun-triggers",
+        "scheduler",
+        "show-failed-logs",
+    ):
+        assert cluster[key] == local[key]
+
+
+@pytest.mark.parametrize("name", ["local", *CLUSTERS])
+def test_the_readme_explains_every_value(root: Path, name: str) -> None:
+    readme = root / "profiles" / ("README.md" if name == "local" else f"{name}/README.md")
+    text = readme.read_text()
+    if name == "kubernetes":
+        text += (root / "profiles" / "slurm" / "README.md").read_text()
+    if name == "slurm-gpu":
+        text += (root / "profiles" / "slurm" / "README.md").read_text()
+    for key in read_profile(root, name):
+        if key != "printshellcmds":
+            assert re.search(rf"`{key}\b", text), f"{readme} does not explain '{key}'"
+
+
+@pytest.mark.parametrize("name", CLUSTERS)
+def test_jobs_ask_for_memory_and_time(small_scene: Path, tmp_path: Path, name: str) -> None:
+    pytest.importorskip(
+        f"snakemake_executor_plugin_{name.split('-')[0]}", reason="the extra is not installed"
+    )
+    storage = ["--default-storage-prefix", str(tmp_path)] if name == "kubernetes" else []
+    outcome = Workflow(tmp_path, name).run(
+        "--dry-run", *storage, "--config", f"images={small_scene / 'images'}", "output=out"
+    )
+    assert outcome.status == 0, outcome.text
+    assert re.search(r"^total +22$", outcome.text, re.M)
+    needs = re.findall(r"^ *resources: (.*)$", outcome.text, re.M)
+    asking = [need for need in needs if "runtime=" in need]
+    assert len(asking) == 21
+    for need in asking:
+        assert 500 <= int(re.search(r"mem_mb=(\d+)", need)[1]) <= 3_000
+        assert 15 <= int(re.search(r"runtime=(\d+)", need)[1]) <= 30
+        assert "disk_mb=1000" in need
+    gpus = [need for need in needs if "gpu=1" in need]
+    assert len(gpus) == (5 if name == "slurm-gpu" else 0)

@@ -1,0 +1,214 @@
+"""Whole runs on a SLURM of virtual nodes, through every fault that a cluster has to offer."""
+
+import contextlib
+import os
+import re
+import shutil
+import signal
+import tempfile
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from slurm_cluster import Cluster, missing_programs, wait_for
+from workflow_runner import Workflow, copy_run, model_bytes
+
+# polls as often as a test wants; everything else is the profile's
+QUICK = ("--slurm-init-seconds-before-status-checks", "2", "--max-status-checks-per-second", "2")
+
+pytestmark = [
+    pytest.mark.workflow,
+    pytest.mark.skipif(
+        bool(missing_programs()),
+        reason=f"not installed: {', '.join(missing_programs())} (slurm-wlm, munge)",
+    ),
+]
+
+
+@pytest.fixture(scope="module")
+def cluster() -> Iterator[Cluster]:
+    """Four nodes of two cores each. Its folder has a short name: a socket's path is limited."""
+    pytest.importorskip("snakemake_executor_plugin_slurm", reason="the extra 'slurm' is not installed")
+    with tempfile.TemporaryDirectory(prefix="slurm") as folder:
+        cluster = Cluster(Path(folder), nodes=4, cpus=2)
+        try:
+            cluster.start()
+            yield cluster
+        finally:
+            cluster.stop()
+
+
+@pytest.fixture
+def on_slurm(cluster: Cluster, tmp_path: Path) -> Workflow:
+    return Workflow(tmp_path, "slurm", cluster.environment)
+
+
+def config_of(scene: Path) -> list[str]:
+    return ["--config", f"images={scene / 'images'}", f"reference={scene / 'reference'}", "output=out"]
+
+
+def process_of(log: Path) -> tuple[int, str] | None:
+    """The process that writes a job's log now, and the SLURM job that it is of."""
+    for process in Path("/proc").glob("[0-9]*"):
+        with contextlib.suppress(OSError):
+            if (process / "fd" / "1").readlink() == log:
+                found = re.search(rb"SLURM_JOB_ID=(\d+)", (process / "environ").read_bytes())
+                if found:
+                    return int(process.name), found[1].decode()
+    return None
+
+
+def wait_for_process(log: Path) -> tuple[int, str]:
+    wait_for(lambda: process_of(log), f"a job that writes {log}", 400)
+    found = process_of(log)
+    assert found is not None, f"{log}: the job ended too early"
+    return found
+
+
+class Storm:
+    """Faults that come down on a run, each on a job of its own."""
+
+    def __init__(self, cluster: Cluster, scene: Path) -> None:
+        self.cluster = cluster
+        self.logs = scene / "logs"
+        self.victims: dict[str, str] = {}
+
+    def hang(self) -> None:
+        """Stop the process of a tile for ever."""
+        pid, self.victims["hung"] = wait_for_process(self.logs / "match_pairs" / "0-0.log")
+        os.kill(pid, signal.SIGSTOP)
+
+    def cancel(self) -> None:
+        """Cancel a running tile."""
+        _, self.victims["cancelled"] = wait_for_process(self.logs / "match_pairs" / "0-1.log")
+        self.cluster.call("scancel", self.victims["cancelled"])
+
+    def lose_node(self) -> None:
+        """Lose the node of a tile with all that runs on it; later the node comes back."""
+        _, number = wait_for_process(self.logs / "match_pairs" / "1-1.log")
+        self.victims["lost"] = number
+        node = self.cluster.job(number)["NodeList"]
+        self.cluster.kill(node)
+        self.cluster.kill_processes(number)
+        wait_for(lambda: self.cluster.job(number)["JobState"] == "NODE_FAIL", "a lost node", 120)
+        self.cluster.start_node(node)
+
+
+@pytest.fixture(scope="module")
+def survived(
+    cluster: Cluster, small_scene: Path, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[Path, str, dict[str, str]]:
+    """A whole run in a storm: its output folder, what it printed, and the SLURM jobs that were hit."""
+    folder = tmp_path_factory.mktemp("storm")
+    shared = {"SNAKESFM_CACHE": str(folder / "shared")}
+    run = Workflow(folder, "slurm", {**cluster.environment, **shared}).start(
+        *QUICK,
+        # each tile has a node of its own
+        *("--retries", "3", "--set-threads", "match_pairs=2"),
+        *(
+            "--set-resources",
+            "match_pairs:runtime=attempt",
+            "calibrate_cameras:mem_mb=min(100 * attempt**4, 5000)",
+        ),
+        *config_of(small_scene),
+    )
+    storm = Storm(cluster, folder / "out" / "square")
+    faults = [storm.hang, storm.cancel, storm.lose_node]
+    threads = [threading.Thread(target=fault, daemon=True) for fault in faults]
+    for thread in threads:
+        thread.start()
+    text, _ = run.communicate(timeout=900)
+    assert run.returncode == 0, text
+    for thread in threads:
+        thread.join(30)
+    return folder / "out" / "square", text, storm.victims
+
+
+def test_a_run_on_slurm_gives_the_model_of_a_local_run_whatever_happens(finished, survived) -> None:
+    output = survived[0]
+    assert model_bytes(output) == model_bytes(finished[0])
+    assert not list(output.rglob("*.tmp"))
+    assert not list(output.rglob("*.refused"))
+
+
+def test_the_folder_that_runs_share_is_used_on_the_nodes(survived) -> None:
+    kept = [path.parts[-3] for path in (survived[0].parents[1] / "shared").rglob("*.h5")]
+    assert sorted(kept) == ["estimate_two_view"] * 3 + ["extract_features"] * 2 + ["match_pairs"] * 3
+
+
+def test_logs_of_all_jobs_are_with_the_scene(finished, survived) -> None:
+    logs = {str(path.relative_to(survived[0])) for path in survived[0].glob("logs/*/*.log")}
+    assert logs == {str(path.relative_to(finished[0])) for path in finished[0].glob("logs/*/*.log")}
+
+
+@pytest.mark.parametrize(
+    ("fault", "state"), [("hung", "TIMEOUT"), ("cancelled", "CANCELLED"), ("lost", "NODE_FAIL")]
+)
+def test_a_job_that_was_hit_is_run_again(cluster: Cluster, survived, fault: str, state: str) -> None:
+    number = survived[2][fault]
+    assert cluster.job(number)["JobState"] == state
+    assert f"SLURM-job '{number}' failed" in survived[1]
+
+
+def test_a_job_over_its_time_gets_more(cluster: Cluster, survived) -> None:
+    limits = [cluster.job(number)["TimeLimit"] for number in cluster.jobs("COMPLETED")]
+    assert cluster.job(survived[2]["hung"])["TimeLimit"] == "00:01:00"
+    assert "00:02:00" in limits
+
+
+def test_a_job_over_its_memory_gets_more(cluster: Cluster, survived) -> None:
+    failed = [cluster.job(number)["MinMemoryNode"] for number in cluster.jobs("FAILED", "OUT_OF_MEMORY")]
+    completed = [cluster.job(number)["MinMemoryNode"] for number in cluster.jobs("COMPLETED")]
+    assert "100M" in failed
+    assert {"1600M", "5000M"} & set(completed)
+
+
+def test_a_controller_that_is_ended_leaves_nothing_that_hinders_the_next(
+    finished, small_scene: Path, cluster: Cluster, on_slurm: Workflow
+) -> None:
+    copy_run(finished[0], on_slurm.folder)
+    output = on_slurm.folder / "out" / "square"
+    arguments = [*QUICK, *config_of(small_scene)]
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGKILL):
+        (output / "adjust_bundle" / "reconstruction.h5").unlink(missing_ok=True)
+        shutil.rmtree(output / "logs" / "adjust_bundle")
+        run = on_slurm.start(*arguments)
+        pid, job = wait_for_process(output / "logs" / "adjust_bundle" / "job.log")
+        if number == signal.SIGKILL:
+            os.kill(pid, signal.SIGSTOP)
+            second = on_slurm.run(*arguments)
+            assert second.status != 0
+            assert re.search(
+                rf"Another run \(process {run.pid} on .*SLURM run .*\) is writing", second.text
+            )
+            assert second.rules == []
+        run.send_signal(number)
+        text, _ = run.communicate(timeout=120)
+        assert run.returncode != 0, text
+        if number == signal.SIGKILL:
+            assert job in cluster.jobs("RUNNING")
+    last = on_slurm.run(*arguments)
+    assert last.status == 0, last.text
+    assert "1 SLURM jobs of an interrupted run were cancelled" in last.text
+    assert "unlock" not in last.text
+    assert cluster.job(job)["JobState"] == "CANCELLED"
+    assert model_bytes(output) == model_bytes(finished[0])
+    assert not list(output.rglob("*.tmp"))
+
+
+def test_jobs_that_cannot_be_ended_are_named_with_what_to_type(
+    finished, small_scene: Path, tmp_path: Path
+) -> None:
+    copy_run(finished[0], tmp_path)
+    (tmp_path / "out" / "square" / "render_report" / "index.html").unlink()
+    (tmp_path / "out" / ".snakesfm.lock").write_text("process 1 on elsewhere, SLURM run some-name\n")
+    programs = tmp_path / "bin"
+    programs.mkdir()
+    (programs / "squeue").write_text("#!/bin/sh\nexit 1\n")
+    (programs / "squeue").chmod(0o755)
+    silent = {**os.environ, "PATH": f"{programs}:{os.environ['PATH']}"}
+    outcome = Workflow(tmp_path, environment=silent).run(*config_of(small_scene))
+    assert outcome.status != 0
+    assert "scancel --name=some-name" in outcome.text
+    assert outcome.rules == []
