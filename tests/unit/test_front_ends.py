@@ -86,11 +86,11 @@ def test_other_weights_change_the_params(tmp_path: Path) -> None:
 
 
 def test_exact_keypoints_are_not_refined_in_the_images(tmp_path: Path) -> None:
-    for front_end, refined in (("virtual", False), ("sift", True)):
+    for front_end, refined in (("virtual", False), ("sift", "auto")):
         plan = plan_of(tmp_path, front_end=front_end, reference=str(tmp_path))
         (scene,) = plan.scenes.values()
         options = json.loads(scene.params("adjust_bundle", {}, True))["options"]
-        assert options["refine_keypoints"] is refined
+        assert options["refine_keypoints"] == refined
 
 
 def test_virtual_and_imported_ask_for_what_they_read(tmp_path: Path) -> None:

@@ -146,6 +146,8 @@ rule adjust_bundle:
         log_file("adjust_bundle"),
     benchmark:
         benchmark_file("adjust_bundle")
+    # keypoints are refined side by side
+    threads: 2
     resources:
         mem_mb=memory_mb("adjust_bundle"),
         runtime=runtime_min("adjust_bundle"),

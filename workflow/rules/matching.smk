@@ -33,6 +33,8 @@ rule calibrate_cameras:
         log_file("calibrate_cameras"),
     benchmark:
         benchmark_file("calibrate_cameras")
+    # pairs are worked on side by side
+    threads: 2
     resources:
         mem_mb=memory_mb("calibrate_cameras"),
         runtime=runtime_min("calibrate_cameras"),

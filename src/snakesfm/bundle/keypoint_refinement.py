@@ -23,6 +23,15 @@ STEP_PX = 1.0
 """How far apart the points are whose projections give the warps."""
 
 
+def most_share_a_camera(camera_ids: Array) -> bool:
+    """Whether more than half of the images (camera ids (N,)) have a camera in common with another image.
+
+    Photographs of many cameras differ in light, season and processing, which moves what pixels agree on.
+    """
+    _, cameras, counts = np.unique(camera_ids, return_inverse=True, return_counts=True)
+    return bool(np.mean(counts[cameras] > 1) > 0.5)
+
+
 def refine_keypoints(
     reconstruction: pycolmap.Reconstruction,
     read_gray: Callable[[int], GrayImage | None],

@@ -10,7 +10,7 @@ from snakesfm.config.base import StageOptions
 class AdjustBundleOptions(StageOptions):
     """How cameras, poses and points are adjusted together."""
 
-    stage_version: ClassVar[int] = 5
+    stage_version: ClassVar[int] = 6
 
     solver: Literal["ceres", "gtsam"] = "ceres"
     """Least-squares solver: Ceres through pycolmap, or gtsam (slower, fewer camera models)."""
@@ -66,8 +66,9 @@ class AdjustBundleOptions(StageOptions):
     complete_error_px: float = Field(default=4.0, gt=0.0)
     """Largest reprojection error of an observation that completion adds."""
 
-    refine_keypoints: bool = True
-    """Before the last two rounds, move each point's observations to where the images' pixels agree best."""
+    refine_keypoints: Literal["auto"] | bool = "auto"
+    """Before the last two rounds, move the observations of each point to where the images' pixels agree
+    best; 'auto' does so where most images share a camera, not in collections of many people's photographs."""
 
     refine_shorter_side_px: int = Field(default=760, ge=64)
     """Larger images are scaled down to this shorter side to refine keypoints; as for detection is best."""

@@ -13,6 +13,7 @@ from snakesfm.artifacts.pairs import ViewGraph
 from snakesfm.bundle.alignment import AlignmentSettings, GrayImage
 from snakesfm.bundle.completion import correspondence_graph
 from snakesfm.bundle.interface import SolverSettings
+from snakesfm.bundle.keypoint_refinement import most_share_a_camera
 from snakesfm.bundle.model import (
     BundleModel,
     from_reconstruction,
@@ -82,7 +83,10 @@ def run(job: StageJob) -> None:
     posed = int(np.isfinite(model.rotations[:, 0, 0] + model.translations[:, 0]).sum())
     shared["min_track_length"] = min(options.min_track_length, max(2, posed))
     settings = RoundSettings(**shared, seed=job.seed_for("bundle"))
-    source = _image_source(job, index) if options.refine_keypoints else None
+    refines = options.refine_keypoints
+    if refines == "auto":
+        refines = most_share_a_camera(index.camera_ids)
+    source = _image_source(job, index) if refines else None
     records = adjust_rounds(reconstruction, graph, cameras, solving, settings, _print_record, source)
     result = from_reconstruction(reconstruction, model)
     if np.isfinite(result.rotations[:, 0, 0]).sum() < 2:
@@ -109,7 +113,8 @@ def _image_source(job: StageJob, index: ImageIndex) -> ImageSource:
     options: AdjustBundleOptions = job.options
     side = options.refine_shorter_side_px
     folder = Path(job.settings["images"])
-    cv2.setNumThreads(job.threads)
+    # the images are worked on side by side
+    cv2.setNumThreads(1)
 
     @lru_cache(maxsize=KEPT_IMAGES)
     def read_gray(row: int) -> GrayImage | None:
@@ -127,7 +132,7 @@ def _image_source(job: StageJob, index: ImageIndex) -> ImageSource:
     return ImageSource(
         read_gray,
         np.maximum(1.0, index.sizes.min(axis=1) / side),
-        AlignmentSettings(options.refine_radius_px, options.refine_min_correlation),
+        AlignmentSettings(options.refine_radius_px, options.refine_min_correlation, threads=job.threads),
         lambda aligned, count: print(f"keypoints refined: {aligned} of {count} observations", flush=True),
     )
 

@@ -10,7 +10,7 @@ from snakesfm.bundle.alignment import (
     align_observations,
     choose_templates,
 )
-from snakesfm.bundle.keypoint_refinement import refine_keypoints
+from snakesfm.bundle.keypoint_refinement import most_share_a_camera, refine_keypoints
 from snakesfm.bundle.model import BundleModel, observations_of, to_reconstruction
 from snakesfm.geometry.camera import Camera
 from snakesfm.geometry.rotations import exp_so3
@@ -164,3 +164,12 @@ def test_the_template_is_the_central_view_with_its_patch_inside():
     assert choose_templates(directions, np.zeros(3), inside, offsets).tolist() == [1]
     assert choose_templates(directions, np.array([0.0, 2.0, 0.0]), inside, offsets).tolist() != [1]
     assert choose_templates(directions, np.zeros(3), np.array([True, False, True]), offsets).tolist() == [0]
+
+
+@pytest.mark.parametrize(
+    ("camera_ids", "shared"),
+    [([0, 0, 0], True), ([0, 1, 2, 3], False), ([0, 0, 1, 2], False), ([0, 0, 1, 1, 2], True)],
+    ids=["one camera", "one each", "half", "two cameras"],
+)
+def test_photographs_of_one_camera_are_told_from_those_of_many(camera_ids: list[int], shared: bool) -> None:
+    assert most_share_a_camera(np.array(camera_ids)) is shared
