@@ -67,8 +67,7 @@ class AdjustBundleOptions(StageOptions):
     """Largest reprojection error of an observation that completion adds."""
 
     refine_keypoints: Literal["auto"] | bool = "auto"
-    """Before the last two rounds, move the observations of each point to where the images' pixels agree
-    best; 'auto' does so where most images share a camera, not in collections of many people's photographs."""
+    """Move each point's observations to where pixels agree best; 'auto': if most images share a camera."""
 
     refine_shorter_side_px: int = Field(default=760, ge=64)
     """Larger images are scaled down to this shorter side to refine keypoints; as for detection is best."""
