@@ -128,6 +128,8 @@ rule adjust_bundle:
         log_file("adjust_bundle"),
     benchmark:
         benchmark_file("adjust_bundle")
+    # keypoints are refined side by side
+    threads: 2
     params:
         job=job_params("adjust_bundle"),
         files=job_files(),

@@ -8,6 +8,7 @@ warp of a plane that faces the cameras.
 """
 
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
@@ -24,6 +25,8 @@ STALLED_PX = 0.1
 """An observation whose last step is larger has not settled."""
 AFFINE_DAMPING = 1e-3
 """Holds the affine part, relative to the weight of the shift, where a patch has little texture."""
+PATCHES_AT_ONCE = 256
+"""Arrays over so many patches stay in a core's cache."""
 
 
 @dataclass(frozen=True)
@@ -43,11 +46,13 @@ class AlignmentSettings:
     radius_px : half the side of the square patch around a keypoint, in pixels of the gray images.
     min_correlation : normalised correlation that an aligned patch must have with its template.
     iterations : most steps per observation.
+    threads : how many images are worked on at a time; results do not depend on it.
     """
 
     radius_px: int = 5
     min_correlation: float = 0.8
     iterations: int = 6
+    threads: int = 1
 
 
 def choose_templates(directions: Array, sizes: Array, inside: Array, offsets: Array) -> Array:
@@ -108,7 +113,9 @@ def align_observations(
     patches = np.zeros((len(sources), side, side), dtype=np.float32)
     scales = np.ones((int(images.max(initial=-1)) + 1, 2))
     x, y = _grid(settings.radius_px + 1)
-    for image, rows in _by_image(images[sources], np.arange(len(sources))):
+
+    def cut(part: tuple[int, Array]) -> None:
+        image, rows = part
         read = read_gray(image)
         if read is not None:
             place = pixels[sources[rows]] / read.scale
@@ -116,22 +123,39 @@ def align_observations(
             patches[rows] = _sample(gray, place[:, :1] + x, place[:, 1:] + y).reshape(-1, side, side)
             scales[image] = read.scale
             aligned[sources[rows]] = True
-    usable &= aligned[templates]
-    position = np.searchsorted(sources, templates)
-    for image, rows in _by_image(images[usable], np.nonzero(usable)[0]):
+
+    def align(part: tuple[int, Array]) -> None:
+        image, rows = part
         read = read_gray(image)
         if read is None:
-            continue
+            return
         own = templates[rows]
-        to_plane = np.linalg.pinv(tangents[own] / scales[images[own], :, None])
+        to_plane = _inverse(tangents[own] / scales[images[own], :, None])
+        chosen = position[rows]
         place, aligned[rows] = _align_in_image(
             read.gray.astype(np.float32),
             pixels[rows] / read.scale,
             tangents[rows] / read.scale[:, None] @ to_plane,
-            patches[position[rows]],
+            patches,
+            inverses,
+            chosen,
             settings,
         )
         moved[rows] = np.where(aligned[rows, None], place * read.scale, pixels[rows])
+
+    # each image writes rows of its own, and OpenCV and numpy run without Python's lock
+    with ThreadPoolExecutor(settings.threads) as pool:
+        list(pool.map(cut, _by_image(images[sources], np.arange(len(sources)))))
+        starts = range(0, len(sources), PATCHES_AT_ONCE)
+        inverses = np.concatenate(
+            [
+                np.zeros((0, 6, 6)),
+                *pool.map(lambda k: _inverse_normals(patches[k : k + PATCHES_AT_ONCE]), starts),
+            ]
+        )
+        usable &= aligned[templates]
+        position = np.searchsorted(sources, templates)
+        list(pool.map(align, _by_image(images[usable], np.nonzero(usable)[0])))
     return moved, aligned
 
 
@@ -152,7 +176,7 @@ def _grid(radius: int) -> tuple[Array, Array]:
 def _sample(gray: Array, x: Array, y: Array) -> Array:
     """Gray values (M,S) float32 at pixels, whose first one has its centre at (0.5, 0.5)."""
     half = np.float32(0.5)
-    columns, rows = x.astype(np.float32) - half, y.astype(np.float32) - half
+    columns, rows = x.astype(np.float32, copy=False) - half, y.astype(np.float32, copy=False) - half
     sampled = np.empty(columns.shape, dtype=np.float32)
     # OpenCV's maps are shorter than 2^15
     for start in range(0, len(columns), 1 << 14):
@@ -164,62 +188,116 @@ def _sample(gray: Array, x: Array, y: Array) -> Array:
 
 
 def _align_in_image(
-    gray: Array, pixels: Array, warps: Array, templates: Array, settings: AlignmentSettings
+    gray: Array,
+    pixels: Array,
+    warps: Array,
+    patches: Array,
+    inverses: Array,
+    chosen: Array,
+    settings: AlignmentSettings,
 ) -> tuple[Array, Array]:
-    """Aligned pixels (M,2) of observations in one image, and which (M,) bool are to be trusted."""
+    """Aligned pixels (M,2) of observations in one image, and which (M,) bool are to be trusted.
+
+    The template of each observation and its inverse normal matrix are the rows ``chosen`` (M,) of
+    ``patches`` and ``inverses``.
+    """
+    place, good = np.empty_like(pixels), np.empty(len(pixels), dtype=bool)
+    for start in range(0, len(pixels), PATCHES_AT_ONCE):
+        part = slice(start, start + PATCHES_AT_ONCE)
+        own = chosen[part]
+        place[part], good[part] = _align_patches(
+            gray, pixels[part], warps[part], patches[own], inverses[own], settings
+        )
+    return place, good
+
+
+def _align_patches(
+    gray: Array, pixels: Array, warps: Array, templates: Array, inverse: Array, settings: AlignmentSettings
+) -> tuple[Array, Array]:
+    """The same for observations (M,) that are few enough, with their templates (M,S,S)."""
     radius = settings.radius_px
-    x, y = _grid(radius)
-    window = np.exp(-(x**2 + y**2) / (2 * (0.6 * radius) ** 2))
-    window /= window.sum()
-    wanted, slopes, inverse = _prepare(templates, x, y, window)
+    grid, window = np.stack(_grid(radius)), _window(radius)
+    wanted, slopes = _prepare(templates, grid)
+    slopes *= window
     place, warps = pixels.copy(), warps.copy()
     last = np.full(len(pixels), np.inf)
     active = np.arange(len(pixels))
     for _ in range(settings.iterations):
-        found, gain = _match(gray, place[active], warps[active], x, y, window, wanted[active])
-        difference = found * gain[:, None] - wanted[active]
-        slope = np.matmul(slopes[active], difference[:, :, None])
+        found, gain = _match(gray, place[active], warps[active], grid, window, wanted[active])
+        found *= gain[:, None]
+        found -= wanted[active]
+        slope = np.matmul(slopes[active], found[:, :, None])
         step = np.matmul(inverse[active], slope)[:, :, 0]
-        turn = np.linalg.inv(np.eye(2) + step[:, 2:].reshape(-1, 2, 2))
+        turn = _inverse(np.eye(2) + step[:, 2:].reshape(-1, 2, 2))
         warps[active] = warps[active] @ turn
         shift = -np.einsum("mij,mj->mi", warps[active], step[:, :2])
         length = np.linalg.norm(shift, axis=1)
         place[active] += shift / np.maximum(length, 1.0)[:, None]
         last[active] = length
         active = active[np.isfinite(length) & (length > CONVERGED_PX)]
+        if not len(active):
+            break
     finite = np.isfinite(place).all(axis=1) & np.isfinite(warps).all(axis=(1, 2))
     good = finite & (last < STALLED_PX) & (np.linalg.norm(place - pixels, axis=1) < MAX_MOVE_PX)
     rows = np.nonzero(good)[0]
-    found, gain = _match(gray, place[rows], warps[rows], x, y, window, wanted[rows])
+    found, gain = _match(gray, place[rows], warps[rows], grid, window, wanted[rows])
     # the gain is the regression of the template on the patch, so their correlation is its share explained
     explained = gain**2 * ((found**2) @ window) / np.maximum((wanted[rows] ** 2) @ window, 1e-12)
     good[rows] = (gain > 0) & (explained > settings.min_correlation**2)
     return place, good
 
 
-def _prepare(templates: Array, x: Array, y: Array, window: Array) -> tuple[Array, Array, Array]:
-    """Templates (M,n) of mean zero, weighted slopes (M,6,n), and inverse normal matrices (M,6,6)."""
+def _window(radius: int) -> Array:
+    """Weights (n,) float32 of the pixels of a patch; they sum to one."""
+    x, y = _grid(radius)
+    window = np.exp(-(x**2 + y**2) / (2 * (0.6 * radius) ** 2))
+    return np.asarray(window / window.sum())
+
+
+def _inverse(matrices: Array) -> Array:
+    """Inverses of (M,2,2); not finite where there is none."""
+    inverse = np.empty_like(matrices)
+    inverse[:, 0, 0], inverse[:, 1, 1] = matrices[:, 1, 1], matrices[:, 0, 0]
+    inverse[:, 0, 1], inverse[:, 1, 0] = -matrices[:, 0, 1], -matrices[:, 1, 0]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        inverse /= (matrices[:, 0, 0] * matrices[:, 1, 1] - matrices[:, 0, 1] * matrices[:, 1, 0])[
+            :, None, None
+        ]
+    return inverse
+
+
+def _prepare(templates: Array, grid: Array) -> tuple[Array, Array]:
+    """Templates (M,n) of mean zero, and their slopes (M,6,n) by shift and affine part."""
     count = len(templates)
     inner = templates[:, 1:-1, 1:-1].reshape(count, -1)
-    wanted = inner - (inner @ window)[:, None]
-    across = (templates[:, 1:-1, 2:] - templates[:, 1:-1, :-2]).reshape(count, -1) / 2
-    down = (templates[:, 2:, 1:-1] - templates[:, :-2, 1:-1]).reshape(count, -1) / 2
-    slopes = np.stack([across, down, across * x, across * y, down * x, down * y], axis=1)
-    weighted = slopes * window
-    normal = np.matmul(weighted, slopes.transpose(0, 2, 1)).astype(np.float64)
+    wanted = inner - (inner @ _window(templates.shape[1] // 2 - 1))[:, None]
+    slopes = np.empty((count, 6, inner.shape[1]), dtype=np.float32)
+    slopes[:, 0] = (templates[:, 1:-1, 2:] - templates[:, 1:-1, :-2]).reshape(count, -1)
+    slopes[:, 1] = (templates[:, 2:, 1:-1] - templates[:, :-2, 1:-1]).reshape(count, -1)
+    slopes[:, :2] /= 2
+    slopes[:, 2:4] = slopes[:, :1] * grid
+    slopes[:, 4:] = slopes[:, 1:2] * grid
+    return wanted, slopes
+
+
+def _inverse_normals(templates: Array) -> Array:
+    """Inverse normal matrices (M,6,6) float64 of the steps that bring patches to templates (M,S,S)."""
+    radius = templates.shape[1] // 2 - 1
+    _, slopes = _prepare(templates, np.stack(_grid(radius)))
+    normal = np.matmul(slopes * _window(radius), slopes.transpose(0, 2, 1)).astype(np.float64)
     strength = normal[:, 0, 0] + normal[:, 1, 1]
-    damping = np.array([0, 0, 1, 1, 1, 1]) * AFFINE_DAMPING * x.max() ** 2 + 1e-6
+    damping = np.array([0, 0, 1, 1, 1, 1]) * AFFINE_DAMPING * float(radius) ** 2 + 1e-6
     normal[:, range(6), range(6)] += damping * np.maximum(strength, 1e-6)[:, None]
-    return wanted, weighted, np.linalg.inv(normal)
+    return np.linalg.inv(normal)
 
 
 def _match(
-    gray: Array, place: Array, warps: Array, x: Array, y: Array, window: Array, wanted: Array
+    gray: Array, place: Array, warps: Array, grid: Array, window: Array, wanted: Array
 ) -> tuple[Array, Array]:
     """Patches (M,n) of mean zero under the warps, and the gains (M,) that bring them to the templates."""
-    columns = place[:, :1] + warps[:, 0, :1] * x + warps[:, 0, 1:] * y
-    rows = place[:, 1:] + warps[:, 1, :1] * x + warps[:, 1, 1:] * y
-    found = _sample(gray, columns, rows)
+    moved = np.matmul(warps.astype(np.float32).reshape(-1, 2), grid).reshape(len(warps), 2, -1)
+    moved += place.astype(np.float32)[:, :, None]
+    found = _sample(gray, moved[:, 0], moved[:, 1])
     found -= (found @ window)[:, None]
     energy = (found**2) @ window
     return found, ((found * wanted) @ window) / np.maximum(energy, 1e-6)

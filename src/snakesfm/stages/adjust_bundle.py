@@ -109,7 +109,8 @@ def _image_source(job: StageJob, index: ImageIndex) -> ImageSource:
     options: AdjustBundleOptions = job.options
     side = options.refine_shorter_side_px
     folder = Path(job.settings["images"])
-    cv2.setNumThreads(job.threads)
+    # the images are worked on side by side
+    cv2.setNumThreads(1)
 
     @lru_cache(maxsize=KEPT_IMAGES)
     def read_gray(row: int) -> GrayImage | None:
@@ -127,7 +128,7 @@ def _image_source(job: StageJob, index: ImageIndex) -> ImageSource:
     return ImageSource(
         read_gray,
         np.maximum(1.0, index.sizes.min(axis=1) / side),
-        AlignmentSettings(options.refine_radius_px, options.refine_min_correlation),
+        AlignmentSettings(options.refine_radius_px, options.refine_min_correlation, threads=job.threads),
         lambda aligned, count: print(f"keypoints refined: {aligned} of {count} observations", flush=True),
     )
 
