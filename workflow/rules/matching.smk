@@ -31,6 +31,8 @@ rule calibrate_cameras:
         log_file("calibrate_cameras"),
     benchmark:
         benchmark_file("calibrate_cameras")
+    # pairs are worked on side by side
+    threads: 2
     params:
         job=job_params("calibrate_cameras"),
         files=job_files(),

@@ -1,7 +1,8 @@
 """Joint refinement of focal lengths over many two-view problems, with the relative poses eliminated."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import cv2
@@ -27,6 +28,10 @@ AGREEMENT = 2.0
 LOG_STEP = 1e-4
 MIN_STRENGTH = 2.0
 MAX_LOG_STEP = 0.25
+# so many points tell which of four poses has them in front of both cameras
+POINTS_IN_FRONT = 100
+# like the builtin map; that of a pool works on several items at a time
+Each = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
 
 
 @dataclass(frozen=True)
@@ -48,7 +53,12 @@ class FocalAdjustment:
 
 
 def adjust_focals(
-    pairs: Sequence[EpipolarPair], focals: Array, free: Array, prior: Array, prior_sigma: Array
+    pairs: Sequence[EpipolarPair],
+    focals: Array,
+    free: Array,
+    prior: Array,
+    prior_sigma: Array,
+    each: Each = map,
 ) -> FocalAdjustment:
     """Refine focal lengths (C,) so that the Sampson errors of all pairs are smallest.
 
@@ -58,6 +68,7 @@ def adjust_focals(
     focals : (C,) start values in pixels.
     free : (C,) bool, whose focal length is adjusted.
     prior, prior_sigma : (C,) focal lengths and their relative standard deviations.
+    each : applies a function to all pairs.
 
     Each pair has its own relative pose, eliminated from its 5 + 2 parameters by a Schur complement, and
     tells the focal lengths as well as its geometry allows: pairs that cannot tell (forward motion, fixation
@@ -65,14 +76,15 @@ def adjust_focals(
     """
     count = len(focals)
     logs, prior_logs = np.log(np.asarray(focals, dtype=np.float64)), np.log(prior)
-    poses = [pose_of(pair, focals) for pair in pairs]
+    poses = list(each(lambda pair: pose_of(pair, focals), pairs))
     held = ~np.asarray(free, dtype=bool)
     information, strengths = np.zeros((count, count)), np.zeros((len(pairs), 2))
     for _ in range(ITERATIONS):
         H, g = np.diag(prior_sigma**-2.0), (logs - prior_logs) * prior_sigma**-2.0
-        for row, pair in enumerate(pairs):
-            poses[row] = refined_pose(pair, poses[row], np.exp(logs))
-            h, b, distance = _reduced(pair, poses[row], np.exp(logs), held)
+        linearise = partial(_linearised, focals=np.exp(logs), held=held)
+        found = list(each(linearise, zip(pairs, poses, strict=True)))
+        poses = [pose for pose, _ in found]
+        for row, (pair, (_, (h, b, distance))) in enumerate(zip(pairs, found, strict=True)):
             weight = 1.0 / (1.0 + (distance / AGREEMENT) ** 2)
             strengths[row] = distance, np.sqrt(np.max(np.diag(h)))
             ends = [pair.camera_i, pair.camera_j]
@@ -112,8 +124,9 @@ def pose_of(pair: EpipolarPair, focals: Array) -> tuple[Array, Array]:
     """The relative pose of the essential matrix nearest to F with these focal lengths."""
     focal_i, focal_j = float(focals[pair.camera_i]), float(focals[pair.camera_j])
     E = np.diag([focal_j, focal_j, 1.0]) @ pair.F @ np.diag([focal_i, focal_i, 1.0])
+    some = slice(None, None, max(1, len(pair.points_i) // POINTS_IN_FRONT))
     _, rotation, translation, _ = cv2.recoverPose(
-        E, pair.points_i / focal_i, pair.points_j / focal_j, np.eye(3)
+        E, pair.points_i[some] / focal_i, pair.points_j[some] / focal_j, np.eye(3)
     )
     return rotation, translation.ravel()
 
@@ -136,6 +149,15 @@ def refined_pose(pair: EpipolarPair, pose: tuple[Array, Array], focals: Array) -
     if not np.isfinite(length) or length < 1e-12:
         return pose
     return np.asarray(found.R), np.asarray(found.t) / length
+
+
+def _linearised(
+    start: tuple[EpipolarPair, tuple[Array, Array]], focals: Array, held: Array
+) -> tuple[tuple[Array, Array], tuple[Array, Array, float]]:
+    """The best pose of a pair from a nearby one, and what :func:`_reduced` gives there."""
+    pair, pose = start
+    pose = refined_pose(pair, pose, focals)
+    return pose, _reduced(pair, pose, focals, held)
 
 
 def _reduced(

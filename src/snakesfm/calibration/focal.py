@@ -1,13 +1,14 @@
 """Focal lengths of cameras that nobody calibrated, from matched pairs and what EXIF says."""
 
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from snakesfm.calibration.adjustment import FocalAdjustment, adjust_focals
+from snakesfm.calibration.adjustment import Each, FocalAdjustment, adjust_focals
 from snakesfm.calibration.epipolar import EpipolarPair, estimate_epipolar_pair
 from snakesfm.calibration.profiles import scan_focals
 from snakesfm.calibration.votes import vote_focals
@@ -87,21 +88,27 @@ def choose_pairs(
 
 
 def calibrate_focals(
-    pairs: Sequence[MatchedPair], cameras: Sequence[Camera], options: "CalibrateCamerasOptions"
+    pairs: Sequence[MatchedPair],
+    cameras: Sequence[Camera],
+    options: "CalibrateCamerasOptions",
+    threads: int = 1,
 ) -> CalibratedFocals:
     """Estimate the focal length of every camera that is not given.
 
     A vote of the fundamental matrices and a scan of the true errors find the neighbourhood, an adjustment
     of all pairs the value; a focal length that too few pairs tell, or too uncertainly, stays at its prior.
+    The result does not depend on ``threads``.
     """
     given = np.array([camera.source == GIVEN for camera in cameras], dtype=bool)
     from_exif = np.array([camera.source == EXIF for camera in cameras], dtype=bool)
     prior = np.array([camera.focal_px for camera in cameras], dtype=np.float64)
     largest = np.array([max(camera.width, camera.height) for camera in cameras], dtype=np.float64)
     low, high = options.min_focal_ratio * largest, options.max_focal_ratio * largest
-    usable = _epipolar_pairs(pairs, cameras, prior, options)
     free = ~given
-    adjustment = _adjust(usable, prior, free, low, high, options)
+    # most of the time is spent in poselib and OpenCV, which run without Python's lock
+    with ThreadPoolExecutor(threads) as pool:
+        usable = _epipolar_pairs(pairs, cameras, prior, options, pool.map)
+        adjustment = _adjust(usable, prior, free, low, high, options, pool.map)
     return _believe(cameras, prior, from_exif, free, low, high, adjustment, options)
 
 
@@ -110,9 +117,10 @@ def _epipolar_pairs(
     cameras: Sequence[Camera],
     prior: Array,
     options: "CalibrateCamerasOptions",
+    each: Each,
 ) -> list[EpipolarPair]:
-    found = (
-        estimate_epipolar_pair(
+    def estimate(pair: MatchedPair) -> EpipolarPair | None:
+        return estimate_epipolar_pair(
             pair.camera_i,
             pair.camera_j,
             cameras[pair.camera_i].normalize(pair.points_i) * prior[pair.camera_i],
@@ -121,9 +129,8 @@ def _epipolar_pairs(
             options.planar_ratio,
             pair.seed,
         )
-        for pair in pairs
-    )
-    return [pair for pair in found if pair is not None]
+
+    return [pair for pair in each(estimate, pairs) if pair is not None]
 
 
 def _adjust(
@@ -133,14 +140,15 @@ def _adjust(
     low: Array,
     high: Array,
     options: "CalibrateCamerasOptions",
+    each: Each,
 ) -> FocalAdjustment:
     # the prior only keeps focal lengths that no pair tells in their place
     weak = np.full(len(prior), options.default_sigma)
     start = vote_focals(pairs, prior, free, low, high)
     if len(prior) > 1:
-        start = adjust_focals(pairs, start, free, prior, weak).focals
-    start = scan_focals(pairs, np.clip(start, low, high), free, low, high)
-    return adjust_focals(pairs, start, free, prior, weak)
+        start = adjust_focals(pairs, start, free, prior, weak, each).focals
+    start = scan_focals(pairs, np.clip(start, low, high), free, low, high, each)
+    return adjust_focals(pairs, start, free, prior, weak, each)
 
 
 def _believe(

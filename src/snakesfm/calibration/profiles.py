@@ -1,12 +1,19 @@
 """Global search for one focal length at a time by the true epipolar errors of its pairs."""
 
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from snakesfm.calibration.adjustment import NOISE_FLOOR_PX, correspondences_of, pose_of, refined_pose
+from snakesfm.calibration.adjustment import (
+    NOISE_FLOOR_PX,
+    Each,
+    correspondences_of,
+    pose_of,
+    refined_pose,
+)
 from snakesfm.calibration.epipolar import EpipolarPair
 from snakesfm.two_view.sampson import cauchy_cost, sampson_errors_px
 
@@ -16,13 +23,19 @@ CAP = 4.0
 
 
 def scan_focals(
-    pairs: Sequence[EpipolarPair], focals: Array, free: Array, low: Array, high: Array
+    pairs: Sequence[EpipolarPair],
+    focals: Array,
+    free: Array,
+    low: Array,
+    high: Array,
+    each: Each = map,
 ) -> Array:
     """Focal lengths (C,) in pixels, each moved to where its pairs agree best, the others held.
 
-    Parameters as in ``votes.vote_focals``. For each value of a logarithmic grid and the present one,
-    every pair gets its best relative pose; what counts is how much its robust Sampson cost exceeds that
-    pair's own minimum over the grid, softened so that a wrong pair cannot outvote the others.
+    Parameters as in ``votes.vote_focals``, and ``each`` as in ``adjustment.adjust_focals``. For each value
+    of a logarithmic grid and the present one, every pair gets its best relative pose; what counts is how
+    much its robust Sampson cost exceeds that pair's own minimum over the grid, softened so that a wrong
+    pair cannot outvote the others.
     """
     focals = np.array(focals, dtype=np.float64)
     for camera in np.nonzero(free)[0]:
@@ -30,17 +43,19 @@ def scan_focals(
         if not own:
             continue
         grid = np.append(np.geomspace(low[camera], high[camera], GRID_SIZE), focals[camera])
+        trials = np.tile(focals, (len(grid), 1))
+        trials[:, camera] = grid
         excess = np.zeros(len(grid))
-        for pair in own:
-            costs = np.empty(len(grid))
-            for row, focal in enumerate(grid):
-                trial = focals.copy()
-                trial[camera] = focal
-                costs[row] = _pair_cost(pair, trial)
+        for costs in each(partial(_pair_costs, trials=trials), own):
             costs -= costs.min()
             excess += np.log1p(costs / CAP)
         focals[camera] = grid[np.argmin(excess)]
     return focals
+
+
+def _pair_costs(pair: EpipolarPair, trials: Array) -> Array:
+    """The pair's costs (G,) with each row of focal lengths (G,C)."""
+    return np.array([_pair_cost(pair, focals) for focals in trials])
 
 
 def _pair_cost(pair: EpipolarPair, focals: Array) -> float:

@@ -74,7 +74,7 @@ def _calibrate(
                 )
             )
         progress.step()
-    result = calibrate_focals(pairs, cameras, options)
+    result = calibrate_focals(pairs, cameras, options, job.threads)
     return result.cameras, result.sigmas, result.pair_counts
 
 
