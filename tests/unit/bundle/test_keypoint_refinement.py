@@ -145,6 +145,16 @@ def test_images_that_cannot_be_read_keep_their_keypoints(scene):
     assert reconstruction.image(3).num_points3D == 150
 
 
+def test_threads_do_not_change_the_result(scene):
+    moved = []
+    for threads in (1, 3):
+        reconstruction = model_of(scene, 0.2)
+        settings = AlignmentSettings(threads=threads)
+        assert refine_keypoints(reconstruction, read(scene[1]), np.ones(5), settings) == (750, 750)
+        moved.append([reconstruction.image(i).point2D(k).xy for i in range(1, 6) for k in range(150)])
+    np.testing.assert_array_equal(*moved)
+
+
 def test_patches_outside_do_not_move(scene):
     images = np.array([0, 1])
     pixels = np.array([[3.0, 3.0], [200.0, 150.0]])

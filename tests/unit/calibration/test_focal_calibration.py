@@ -74,6 +74,13 @@ def test_one_camera_of_all_images(focal: float) -> None:
     assert result.pair_counts[0] >= 10
 
 
+def test_threads_do_not_change_the_result() -> None:
+    pairs = [view_pair(10 + k, 1000.0, 1000.0) for k in range(6)]
+    one, three = (calibrate_focals(pairs, [camera(1200.0)], OPTIONS, threads) for threads in (1, 3))
+    assert one.cameras == three.cameras
+    np.testing.assert_array_equal(one.sigmas, three.sigmas)
+
+
 def test_cameras_of_their_own_beside_a_given_one() -> None:
     focals = [900.0, 1400.0, 700.0, 1100.0]
     pairs = [
