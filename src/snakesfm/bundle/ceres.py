@@ -48,6 +48,6 @@ def _options(settings: SolverSettings) -> pycolmap.BundleAdjustmentOptions:
     solver.function_tolerance = settings.function_tolerance
     solver.num_threads = settings.threads
     # a robust loss needs few iterations if points follow the cameras; Ceres ends this where it gains little
-    solver.use_inner_iterations = True
+    solver.use_inner_iterations = settings.inner_iterations
     solver.inner_iteration_tolerance = INNER_TOLERANCE
     return options

@@ -18,6 +18,7 @@ class SolverSettings:
         gtsam holds principal points.
     constant_rotations : hold all rotations.
     max_iterations, function_tolerance : when the solver stops.
+    inner_iterations : Ceres adjusts points and cameras by turns after each step: fewer, but dearer ones.
     threads : of the solver.
     """
 
@@ -30,6 +31,7 @@ class SolverSettings:
     constant_rotations: bool = False
     max_iterations: int = 100
     function_tolerance: float = 1e-6
+    inner_iterations: bool = True
     threads: int = 1
 
 

@@ -179,6 +179,8 @@ class _Mapper:
                 solving,
                 function_tolerance=solving.function_tolerance * EARLY_TOLERANCE,
                 loss_scale_px=settings.early_loss_share * threshold_px,
+                # the few steps of a coarse pass cost less than these need to be prepared
+                inner_iterations=False,
                 refine_distortion=solving.refine_distortion
                 and len(self.records) + 1 >= settings.distortion_from_round,
             )

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from snakesfm.tracks.split import cycle_support, split_conflicts
+from snakesfm.tracks.split import cycle_support, split_conflicts, unconfirmed_links
 
 Array = NDArray[Any]
 
@@ -40,10 +40,11 @@ def build_tracks(
 ) -> Tracks:
     """Join matches to tracks that see each image at most once.
 
-    Connected components of the match graph; those that see an image at two places are split at their
-    weakest links (see :func:`snakesfm.tracks.split.split_conflicts`), a link's strength being the number
-    of 3-cycles that confirm it, then the number of matches of its pair. SIFT gives one place once per
-    dominant orientation; such keypoints make tracks of their own unless a match joins them.
+    Connected components of the match graph, less the links that no 3-cycle confirms where most are
+    confirmed (see :func:`snakesfm.tracks.split.unconfirmed_links`). Those that see an image at two places
+    are split at their weakest links (see :func:`snakesfm.tracks.split.split_conflicts`), a link's strength
+    being the number of 3-cycles that confirm it, then the number of matches of its pair. SIFT gives one
+    place once per dominant orientation; such keypoints make tracks of their own unless a match joins them.
 
     Parameters
     ----------
@@ -69,6 +70,8 @@ def build_tracks(
     nodes, flat = np.unique(links, return_inverse=True)
     links = flat.reshape(-1, 2).astype(np.int64)
     images = (np.searchsorted(base, nodes, side="right") - 1).astype(np.int64)
+    sound = ~unconfirmed_links(links, images)
+    links, weights = links[sound], weights[sound]
     labels = _components(links, len(nodes))
     in_conflict = _conflicting(labels, images)
     conflicts = len(np.unique(labels[in_conflict]))

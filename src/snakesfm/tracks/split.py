@@ -1,4 +1,4 @@
-"""Splitting of components that see an image twice, at their weakest links."""
+"""Splitting of components at links that nothing confirms, and where they see an image twice."""
 
 from typing import Any
 
@@ -27,6 +27,46 @@ def cycle_support(links: Array, count: int) -> Array:
     adjacency = half + half.T
     paths = (adjacency @ adjacency).multiply(half).tocsr()
     return np.asarray(paths[links[:, 0], links[:, 1]]).ravel().astype(np.int64)
+
+
+def unconfirmed_links(links: Array, images: Array) -> Array:
+    """Links that no 3-cycle confirms, where being confirmed is the rule.
+
+    A wrong match joins the tracks of two points though no image sees both; the longest tracks of a scene
+    with look-alikes are such. A right one has mostly been found by way of a third image too. Asked are
+    only links at keypoints that some 3-cycle confirms. It is the rule in image pairs with more confirmed
+    links than others, and between two images of which each has more, if such pairs connect them otherwise.
+
+    Parameters
+    ----------
+    links : (M,2) int64, nodes in 0 .. K-1; each link once.
+    images : (K,) int64, image of each node.
+
+    Returns
+    -------
+    (M,) bool.
+    """
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    if len(links) == 0:
+        return np.zeros(0, dtype=bool)
+    confirmed = cycle_support(links, len(images)) > 0
+    known = np.zeros(len(images), dtype=bool)
+    known[links[confirmed].ravel()] = True
+    doubtful = ~confirmed & known[links].any(axis=1)
+    count = int(images.max()) + 1
+    ends = images[links]
+    keys, pair_of = np.unique(ends[:, 0] * count + ends[:, 1], return_inverse=True)
+    excess = np.where(confirmed, 1.0, np.where(doubtful, -1.0, 0.0))
+    pair_rule = np.bincount(pair_of, weights=excess, minlength=len(keys)) > 0
+    image_rule = np.bincount(ends.ravel(), weights=np.repeat(excess, 2), minlength=count) > 0
+    pairs = np.stack([keys // count, keys % count])
+    firm = pairs[:, pair_rule]
+    graph = coo_matrix((np.ones(firm.shape[1], dtype=np.int8), firm), shape=(count, count))
+    part = connected_components(graph, directed=False)[1]
+    rule = pair_rule | (image_rule[pairs].all(axis=0) & (part[pairs[0]] == part[pairs[1]]))
+    return np.asarray(doubtful & rule[pair_of])
 
 
 def split_conflicts(

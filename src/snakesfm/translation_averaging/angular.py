@@ -11,7 +11,7 @@ from snakesfm.translation_averaging.problem import PositioningProblem
 
 Array = NDArray[Any]
 
-DIRECT_CAMERAS = 1000
+DIRECT_CAMERAS = 300
 """Cameras up to which the reduced system is factored; the factor of a larger one grows faster than it."""
 
 CG_TOLERANCE = 1e-4

@@ -1,4 +1,4 @@
-"""When the rounds of bundle adjustment refine focal length and distortion."""
+"""How the rounds of bundle adjustment are solved: what they refine, and by which iterations."""
 
 from dataclasses import replace
 
@@ -86,3 +86,9 @@ def test_a_camera_gone_wild_is_free_again_in_the_next_pass(passes, monkeypatch):
 
 def test_a_camera_that_is_always_wild_keeps_its_first_intrinsics():
     np.testing.assert_array_equal(adjusted(max_focal_change=1.001), START.params)
+
+
+def test_only_the_last_round_iterates_within_its_steps(passes):
+    found = adjusted(refine_principal_points=False)
+    assert [told.inner_iterations for told in passes] == [False, False, True]
+    assert abs(found[0] - TRUE.params[0]) < 5.0
