@@ -62,6 +62,7 @@ NEEDS = {
     "triangulate_tracks": Need("scene", 600, 1.6, image_s=0.25),
     "adjust_bundle": Need("scene", 800, 4.5, 0.01, image_s=2.4),
     "export_database": Need("scene", 600, 1.0, 0.03, image_s=0.1, pair_s=0.01),
+    "export_hloc": Need("scene", 600, 1.0, 0.03, image_s=0.1, pair_s=0.01),
     "export_model": Need("scene", 600, 1.6, image_s=0.2),
     "evaluate_model": Need("scene", 800, 0.2, image_s=0.06),
     "render_report": Need("scene", 600, 0.5, image_s=0.06),

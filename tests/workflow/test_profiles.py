@@ -16,9 +16,9 @@ def read_profile(root: Path, name: str) -> dict:
     return yaml.safe_load((root / "profiles" / name / "profile.yaml").read_text())
 
 
-def test_a_gpu_is_all_that_slurm_gpu_adds_to_slurm(root: Path) -> None:
+def test_slurm_is_slurm_gpu_without_gpus(root: Path) -> None:
     plain, gpu = read_profile(root, "slurm"), read_profile(root, "slurm-gpu")
-    assert gpu.pop("set-resources") == {"extract_features": {"gpu": 1}, "match_pairs": {"gpu": 1}}
+    assert plain.pop("set-resources") == {"extract_features": {"gpu": 0}, "match_pairs": {"gpu": 0}}
     assert gpu == plain
 
 
@@ -67,5 +67,20 @@ def test_jobs_ask_for_memory_and_time(small_scene: Path, tmp_path: Path, name: s
         assert 500 <= int(re.search(r"mem_mb=(\d+)", need)[1]) <= 3_000
         assert 15 <= int(re.search(r"runtime=(\d+)", need)[1]) <= 30
         assert "disk_mb=1000" in need
-    gpus = [need for need in needs if "gpu=1" in need]
-    assert len(gpus) == (5 if name == "slurm-gpu" else 0)
+    assert not [need for need in needs if "gpu=1" in need]
+
+
+@pytest.mark.parametrize(("name", "gpus"), [("slurm", 0), ("slurm-gpu", 5)])
+def test_networks_ask_for_a_gpu_where_the_profile_has_them(
+    small_scene: Path, tmp_path: Path, name: str, gpus: int
+) -> None:
+    pytest.importorskip("snakemake_executor_plugin_slurm", reason="the extra is not installed")
+    outcome = Workflow(tmp_path, name).run(
+        "--dry-run",
+        "--config",
+        f"images={small_scene / 'images'}",
+        "output=out",
+        "front_end=aliked+lightglue",
+    )
+    assert outcome.status == 0, outcome.text
+    assert len(re.findall(r"^ *resources: .*gpu=1", outcome.text, re.M)) == gpus

@@ -47,6 +47,9 @@ rule export_hloc:
         log_file("export_hloc"),
     benchmark:
         benchmark_file("export_hloc")
+    resources:
+        mem_mb=memory_mb("export_hloc"),
+        runtime=runtime_min("export_hloc"),
     params:
         job=job_params("export_hloc"),
         files=job_files(),
