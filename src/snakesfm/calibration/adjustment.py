@@ -28,8 +28,8 @@ AGREEMENT = 2.0
 LOG_STEP = 1e-4
 MIN_STRENGTH = 2.0
 MAX_LOG_STEP = 0.25
-# so many points tell which of four poses has them in front of both cameras
-POINTS_IN_FRONT = 100
+# at most so many points tell which of four poses has them in front of both cameras
+POINTS_IN_FRONT = 50
 # like the builtin map; that of a pool works on several items at a time
 Each = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
 
@@ -124,7 +124,7 @@ def pose_of(pair: EpipolarPair, focals: Array) -> tuple[Array, Array]:
     """The relative pose of the essential matrix nearest to F with these focal lengths."""
     focal_i, focal_j = float(focals[pair.camera_i]), float(focals[pair.camera_j])
     E = np.diag([focal_j, focal_j, 1.0]) @ pair.F @ np.diag([focal_i, focal_i, 1.0])
-    some = slice(None, None, max(1, len(pair.points_i) // POINTS_IN_FRONT))
+    some = slice(None, None, max(1, -(-len(pair.points_i) // POINTS_IN_FRONT)))
     _, rotation, translation, _ = cv2.recoverPose(
         E, pair.points_i[some] / focal_i, pair.points_j[some] / focal_j, np.eye(3)
     )
