@@ -93,7 +93,7 @@ def group(results: Iterable[Result]) -> dict[Key, list[Result]]:
 def spread(column: Column, results: Iterable[Result]) -> Spread | None:
     """A column over the seeds; None where no result has it.
 
-    Timings are of undisturbed runs where there are some.
+    Timings are of undisturbed runs where there are some, else the shortest: the load of others only adds.
     """
     values, disturbed = [], False
     runs = list(results)
@@ -106,7 +106,8 @@ def spread(column: Column, results: Iterable[Result]) -> Spread | None:
             values.append(float(value))
     if not values:
         return None
-    return Spread(statistics.median(values), min(values), max(values), disturbed)
+    middle = min(values) if disturbed else statistics.median(values)
+    return Spread(middle, min(values), max(values), disturbed)
 
 
 def best_peer(

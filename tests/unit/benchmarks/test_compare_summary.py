@@ -72,6 +72,8 @@ def test_disturbed_timings_count_only_where_there_are_no_others() -> None:
     seconds = column("total_seconds")
     assert (spread(seconds, [calm, loud]).median, spread(seconds, [calm, loud]).disturbed) == (4.0, False)
     assert (spread(seconds, [loud]).median, spread(seconds, [loud]).disturbed) == (18.0, True)
+    louder = result(OURS, 2, 90.0, 12.0, others=0.5)
+    assert spread(seconds, [loud, louder]).median == 18.0
     assert spread(column(AREA), [calm, loud]).least == 90.0
 
 
