@@ -1,6 +1,5 @@
 """The methods that are compared: each goes from images, or from an exported database, to a model."""
 
-import csv
 import json
 import re
 import shutil
@@ -33,7 +32,9 @@ MAP = (
     "adjust_bundle",
 )
 STARTED = re.compile(r"^(\d{4}-\d\d-\d\dT\S+) (\w+) (?!done in )", re.M)
-ENDED = re.compile(r"^(\d{4}-\d\d-\d\dT\S+) (\w+) done in [\d.]+ s, ([\d.]+) s of processor time", re.M)
+ENDED = re.compile(
+    r"^(\d{4}-\d\d-\d\dT\S+) (\w+) done in [\d.]+ s, ([\d.]+) s of processor time, (\d+) MB at most$", re.M
+)
 
 
 def snakesfm(
@@ -64,7 +65,7 @@ def stage_costs(logs: Path, whole: Cost) -> dict[str, Cost]:
     """Cost of extract, match and map, from the last start and end in each job's log.
 
     The wall clock of a group runs from the end of the group before it to the end of its own last job, so
-    that what Snakemake does between jobs is counted. Memory is the largest job's, as Snakemake saw it.
+    that what Snakemake does between jobs is counted. Memory is the largest job's.
     """
     jobs = {path: path.read_text("utf-8") for path in logs.glob("*/*.log")}
     costs: dict[str, Cost] = {}
@@ -77,23 +78,10 @@ def stage_costs(logs: Path, whole: Cost) -> dict[str, Cost]:
         ]
         until = max((_clock(found[1]) for found in ends), default=since)
         cpu_seconds = sum(float(found[3]) for found in ends)
-        peak_mib = max((_largest_mib(logs.parent / "benchmarks" / stage) for stage in stages), default=0.0)
+        peak_mib = max((float(found[4]) for found in ends), default=0.0)
         costs[name] = Cost(round(until - since, 2), round(cpu_seconds, 2), peak_mib, whole.others)
         since = until
     return costs
-
-
-def _largest_mib(folder: Path) -> float:
-    """The largest resident memory in a stage's benchmark files; 0 where there is none."""
-    sizes = [0.0]
-    for path in folder.glob("*.tsv"):
-        with path.open(encoding="utf-8") as file:
-            sizes += [
-                float(row["max_rss"])
-                for row in csv.DictReader(file, delimiter="\t")
-                if row["max_rss"] != "NA"
-            ]
-    return max(sizes)
 
 
 def _last(pattern: re.Pattern[str], text: str) -> re.Match[str] | None:

@@ -23,7 +23,7 @@ class Call:
     ----------
     stage : verb_noun name of the stage.
     params : ``options``, ``stage_version``, ``settings`` and ``seed``.
-    files : ``scene``, ``inputs`` by name and ``outputs``.
+    files : ``scene``, ``inputs`` by name, ``outputs``, and ``upstream``: options digests of what is read.
     threads : how many threads may be used.
     log : the job's log.
     """
@@ -121,7 +121,7 @@ def _bind(call: Call, terminal: Any) -> Any:
         seed=params["seed"],
         threads=call.threads,
         former=former if former.is_file() else None,
-        upstream=params["upstream"],
+        upstream=call.files["upstream"],
     )
 
 

@@ -218,7 +218,7 @@ class ScenePlan:
         if options.method == "exhaustive":
             return everything
         if options.method == "listed":
-            lines = Path(self.inputs.pairs).expanduser().read_text("utf-8", errors="replace").splitlines()
+            lines = Path(self.pairs_file).expanduser().read_text("utf-8", errors="replace").splitlines()
             return min(len(lines), everything)
         # a similar image is mostly found from one side alone
         per_image = options.look_ahead * ("sequential" in options.method)
@@ -297,26 +297,19 @@ class ScenePlan:
             return {"reference": inputs.reference, "reference_content": _file_digest(inputs.reference)}
         return {}
 
-    def params(
-        self, stage: str, wildcards: Mapping[str, str], inputs: Iterable[str], main_process: bool
-    ) -> str:
-        """All that determines a job's result beside its input files, as one canonical JSON string.
-
-        The versions and options of the stages that made the input files are part of it, so that the job can
-        check what it is given.
-        """
+    def params(self, stage: str, wildcards: Mapping[str, str], main_process: bool) -> str:
+        """All that determines a job's result beside its input files, as one canonical JSON string."""
         options = self.options(stage)
         content = {
             "options": json.loads(options.canonical_json()),
             "stage_version": options.stage_version,
             "settings": self.settings(stage, wildcards, main_process),
             "seed": self.configuration.seed,
-            "upstream": self._upstream(inputs),
         }
         return json.dumps(content, sort_keys=True)
 
-    def _upstream(self, inputs: Iterable[str]) -> dict[str, str]:
-        """The options digest of every stage that made one of these files."""
+    def upstream(self, inputs: Iterable[str]) -> dict[str, str]:
+        """The options digest of every stage that made one of these files; a job checks them against it."""
         stages = {part for path in inputs for part in Path(path).parent.parts[-3:] if part in STAGES}
         return {stage: self._options_digests[stage] for stage in sorted(stages)}
 

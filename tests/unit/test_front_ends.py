@@ -50,7 +50,7 @@ def test_the_default_needs_no_network(tmp_path: Path) -> None:
     assert plan.models == []
     (scene,) = plan.scenes.values()
     assert scene.method("extract_features") == "sift" and scene.gpus("extract_features") == 0
-    assert "weights" not in scene.params("extract_features", {"block": "0"}, [], True)
+    assert "weights" not in scene.params("extract_features", {"block": "0"}, True)
 
 
 @pytest.mark.parametrize("matcher", TRAINED_ON)
@@ -64,10 +64,10 @@ def test_a_front_end_sets_the_methods_and_names_its_weights(tmp_path: Path) -> N
     plan = plan_of(tmp_path, front_end="aliked+lightglue", weights=str(tmp_path / "w"))
     (scene,) = plan.scenes.values()
     assert plan.models == ["aliked", "aliked_lightglue"]
-    extract = json.loads(scene.params("extract_features", {"block": "0"}, [], True))
+    extract = json.loads(scene.params("extract_features", {"block": "0"}, True))
     assert extract["options"]["method"] == "aliked"
     assert extract["settings"]["models"] == ["aliked"] and scene.gpus("extract_features") == 1
-    match = json.loads(scene.params("match_pairs", {"tile": "0-0"}, [], True))
+    match = json.loads(scene.params("match_pairs", {"tile": "0-0"}, True))
     assert match["options"]["method"] == "lightglue" and match["settings"]["detector"] == "aliked"
     command = match["settings"]["fetch"]
     assert command.startswith("snakemake fetch_weights --config front_end=aliked+lightglue")
@@ -78,7 +78,7 @@ def test_other_weights_change_the_params(tmp_path: Path) -> None:
     def params() -> str:
         plan = plan_of(tmp_path, front_end="xfeat+lighterglue", weights=str(tmp_path))
         (scene,) = plan.scenes.values()
-        return scene.params("extract_features", {"block": "0"}, [], True)
+        return scene.params("extract_features", {"block": "0"}, True)
 
     before = params()
     (tmp_path / "xfeat.pt").write_bytes(b"some")
@@ -89,7 +89,7 @@ def test_exact_keypoints_are_not_refined_in_the_images(tmp_path: Path) -> None:
     for front_end, refined in (("virtual", False), ("sift", "auto")):
         plan = plan_of(tmp_path, front_end=front_end, reference=str(tmp_path))
         (scene,) = plan.scenes.values()
-        options = json.loads(scene.params("adjust_bundle", {}, [], True))["options"]
+        options = json.loads(scene.params("adjust_bundle", {}, True))["options"]
         assert options["refine_keypoints"] == refined
 
 
@@ -103,6 +103,6 @@ def test_virtual_and_imported_ask_for_what_they_read(tmp_path: Path) -> None:
     (folder / "pairs.txt").write_text("0.jpg 1.jpg\n")
     (scene,) = plan_of(tmp_path, front_end="imported", imported=str(folder)).scenes.values()
     assert scene.select_pairs.method == "listed" and scene.pairs_file == str(folder / "pairs.txt")
-    before = scene.params("match_pairs", {"tile": "0-0"}, [], True)
+    before = scene.params("match_pairs", {"tile": "0-0"}, True)
     (folder / "matches.h5").write_bytes(b"matches")
-    assert before != scene.params("match_pairs", {"tile": "0-0"}, [], True)
+    assert before != scene.params("match_pairs", {"tile": "0-0"}, True)

@@ -70,12 +70,12 @@ def test_small_scenes_are_exhaustive_and_large_ones_retrieve(tmp_path: Path) -> 
 
 def test_params_are_canonical_and_follow_content_not_time(tmp_path: Path) -> None:
     folder = make_images(tmp_path / "scene", 3)
-    first = plan_of(tmp_path, images=str(folder)).scenes["scene"].params("index_images", {}, [], True)
+    first = plan_of(tmp_path, images=str(folder)).scenes["scene"].params("index_images", {}, True)
     for image in folder.iterdir():
         image.touch()
-    again = plan_of(tmp_path, images=str(folder)).scenes["scene"].params("index_images", {}, [], True)
+    again = plan_of(tmp_path, images=str(folder)).scenes["scene"].params("index_images", {}, True)
     (folder / "001.jpg").write_bytes(b"other bytes")
-    changed = plan_of(tmp_path, images=str(folder)).scenes["scene"].params("index_images", {}, [], True)
+    changed = plan_of(tmp_path, images=str(folder)).scenes["scene"].params("index_images", {}, True)
     assert first == again != changed
     assert json.dumps(json.loads(first), sort_keys=True) == first
 

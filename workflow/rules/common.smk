@@ -79,9 +79,10 @@ def any_of(names):
 def job_params(stage):
     """A params function: the canonical JSON of all that determines a job's result beside its inputs."""
 
-    def render(wildcards, input):
+    # of wildcards alone: Snakemake does not track a params function that takes more
+    def render(wildcards):
         scene = PLAN.scenes[wildcards.scene]
-        return scene.params(stage, wildcards, input, workflow.is_main_process)
+        return scene.params(stage, wildcards, workflow.is_main_process)
 
     return render
 
@@ -106,6 +107,7 @@ def job_files():
                 for name, value in input.items()
             },
             "outputs": list(output)[:MOST_LISTED_OUTPUTS],
+            "upstream": PLAN.scenes[wildcards.scene].upstream(input),
         }
         return json.dumps(call)
 

@@ -240,6 +240,8 @@ def _align_patches(
     finite = np.isfinite(place).all(axis=1) & np.isfinite(warps).all(axis=(1, 2))
     good = finite & (last < STALLED_PX) & (np.linalg.norm(place - pixels, axis=1) < MAX_MOVE_PX)
     rows = np.nonzero(good)[0]
+    if not len(rows):
+        return place, good
     found, gain = _match(gray, place[rows], warps[rows], grid, window, wanted[rows])
     # the gain is the regression of the template on the patch, so their correlation is its share explained
     explained = gain**2 * ((found**2) @ window) / np.maximum((wanted[rows] ** 2) @ window, 1e-12)

@@ -127,25 +127,25 @@ def test_stage_costs_are_read_from_the_last_run_in_the_logs(tmp_path: Path) -> N
     log(
         "index_images",
         "00:00.000 index_images out/index.h5",
-        "00:01.000 index_images done in 1.00 s, 0.50 s of processor time",
+        "00:01.000 index_images done in 1.00 s, 0.50 s of processor time, 96 MB at most",
         "10:00.000 index_images out/index.h5",
-        "10:02.000 index_images done in 2.00 s, 1.50 s of processor time",
+        "10:02.000 index_images done in 2.00 s, 1.50 s of processor time, 96 MB at most",
     )
     log(
         "match_pairs",
         "10:03.000 match_pairs out/0-0.h5",
-        "10:09.500 match_pairs done in 6.50 s, 6.00 s of processor time",
+        "10:09.500 match_pairs done in 6.50 s, 6.00 s of processor time, 96 MB at most",
     )
     log(
         "adjust_bundle",
         "10:10.000 adjust_bundle out/reconstruction.h5",
-        "10:12.000 adjust_bundle done in 2.00 s, 1.75 s of processor time",
+        "10:12.000 adjust_bundle done in 2.00 s, 1.75 s of processor time, 96 MB at most",
     )
     costs = stage_costs(tmp_path / "logs", Cost(20.0, 12.0, 300.0))
-    assert {name: (cost.seconds, cost.cpu_seconds) for name, cost in costs.items()} == {
-        "extract": (2.0, 1.5),
-        "match": (7.5, 6.0),
-        "map": (2.5, 1.75),
+    assert {name: (cost.seconds, cost.cpu_seconds, cost.peak_mib) for name, cost in costs.items()} == {
+        "extract": (2.0, 1.5, 96.0),
+        "match": (7.5, 6.0, 96.0),
+        "map": (2.5, 1.75, 96.0),
     }
 
 

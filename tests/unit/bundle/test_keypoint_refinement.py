@@ -145,6 +145,20 @@ def test_images_that_cannot_be_read_keep_their_keypoints(scene):
     assert reconstruction.image(3).num_points3D == 150
 
 
+def test_an_image_in_which_nothing_can_be_aligned_keeps_its_keypoints(scene):
+    points, images, poses, pixels = scene
+    noise = np.random.default_rng(0).integers(0, 255, images[2].shape).astype(np.uint8)
+    for point in range(8):
+        one = (points[point : point + 1], images, poses, pixels[:, point : point + 1])
+        reconstruction = model_of(one, 0.35)
+        before = reconstruction.image(3).point2D(0).xy.copy()
+        aligned, count = refine_keypoints(
+            reconstruction, read([*images[:2], noise, *images[3:]]), np.ones(5), SETTINGS
+        )
+        assert 1 <= aligned <= count == 5
+        assert np.array_equal(reconstruction.image(3).point2D(0).xy, before) or aligned == 5
+
+
 def test_threads_do_not_change_the_result(scene):
     moved = []
     for threads in (1, 3):
