@@ -22,10 +22,12 @@ class TrackTable(Artifact):
     """Tracks: sets of keypoints that show one point, sorted by image within a track."""
 
     kind: ClassVar[str] = "tracks"
+    format_version: ClassVar[int] = 2
 
     offsets: Array = column("(T+1)", "int64", "rows offsets[k]:offsets[k+1] belong to track k")
     image_ids: Array = column("(L)", "int32", "row of the image in the index")
     keypoint_ids: Array = column("(L)", "int32", "row of the keypoint in its image")
+    part_ids: Array = column("(L)", "int32", "part of a track that hangs together by confirmed matches")
     keypoints: Array = column("(L,2)", "float32", "x, y in original pixels")
     colors: Array = column("(L,3)", "uint8", "RGB of the image at the keypoint")
 
@@ -39,7 +41,7 @@ class CameraCenters(Artifact):
     centers: Array = column("(N,3)", "float64", "camera centre in the world; NaN where there is none")
     edge_residuals_deg: Array = column("(E)", "float64", "angle of the edge's direction to the centres")
     edge_used: Array = column("(E)", "bool", "the edge's direction took part")
-    ray_track_ids: Array = column("(Q)", "int64", "track of each camera-landmark ray that took part")
+    ray_track_ids: Array = column("(Q)", "int64", "part of a track of each camera-landmark ray")
     ray_residuals_deg: Array = column("(Q)", "float64", "angle of the ray to its landmark")
 
 

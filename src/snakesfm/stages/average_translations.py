@@ -49,22 +49,24 @@ def run(job: StageJob) -> None:
         (graph.labels == 0) & (averaged.labels == 0) & turned[graph.pairs[:, 0]] & turned[graph.pairs[:, 1]]
     )
     usable &= (graph.kinds != KINDS.index("rotation_only")) & np.isfinite(graph.translations[:, 0])
-    track_ids = np.repeat(np.arange(len(tracks.offsets) - 1), np.diff(tracks.offsets))
-    rows = turned[tracks.image_ids]
+    # a part that a look-alike joined to a track is a landmark of its own: positioning cannot throw out rays
+    by_part = np.argsort(tracks.part_ids, kind="stable")
+    image_ids, keypoints = tracks.image_ids[by_part], tracks.keypoints[by_part]
+    rows = turned[image_ids]
     normalized = np.zeros((len(rows), 2))
     for camera_id, camera in enumerate(cameras):
-        mine = index.camera_ids[tracks.image_ids] == camera_id
-        normalized[mine] = camera.normalize(tracks.keypoints[mine])
+        mine = index.camera_ids[image_ids] == camera_id
+        normalized[mine] = camera.normalize(keypoints[mine])
     rows &= np.isfinite(normalized.sum(axis=1))
     pairs = graph.pairs[usable].astype(np.int64)
-    images = tracks.image_ids[rows].astype(np.int64)
+    images = image_ids[rows].astype(np.int64)
     problem = PositioningProblem(
         image_count=len(index.names),
         pairs=pairs,
         directions=edge_directions(rotations, pairs, graph.translations[usable]),
         sigmas_rad=_direction_sigmas(graph.covariances[usable]),
         ray_images=images,
-        ray_tracks=track_ids[rows],
+        ray_tracks=tracks.part_ids[by_part][rows].astype(np.int64),
         rays=world_rays(rotations, images, normalized[rows]),
     )
     limits = SupportLimits(

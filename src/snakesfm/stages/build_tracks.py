@@ -57,6 +57,7 @@ def run(job: StageJob) -> None:
         offsets=tracks.offsets,
         image_ids=tracks.image_ids,
         keypoint_ids=tracks.keypoint_ids,
+        part_ids=tracks.part_ids,
         keypoints=np.concatenate(keypoints)[rows],
         colors=np.concatenate(colors)[rows],
     ).write(job.output, job.header)

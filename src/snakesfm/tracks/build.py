@@ -20,12 +20,14 @@ class Tracks:
     offsets : (T+1,) int64.
     image_ids : (L,) int32, ascending within a track.
     keypoint_ids : (L,) int32, row of the keypoint in its image.
+    part_ids : (L,) int32, parts of tracks that hang together by confirmed matches, over all tracks.
     conflicts : components of matches that saw an image twice.
     """
 
     offsets: Array
     image_ids: Array
     keypoint_ids: Array
+    part_ids: Array
     conflicts: int
 
 
@@ -40,11 +42,11 @@ def build_tracks(
 ) -> Tracks:
     """Join matches to tracks that see each image at most once.
 
-    Connected components of the match graph, less the links that no 3-cycle confirms where most are
-    confirmed (see :func:`snakesfm.tracks.split.unconfirmed_links`). Those that see an image at two places
-    are split at their weakest links (see :func:`snakesfm.tracks.split.split_conflicts`), a link's strength
-    being the number of 3-cycles that confirm it, then the number of matches of its pair. SIFT gives one
-    place once per dominant orientation; such keypoints make tracks of their own unless a match joins them.
+    Connected components of the match graph. Those that see an image at two places are split at their
+    weakest links (see :func:`snakesfm.tracks.split.split_conflicts`), a link's strength being the number of
+    3-cycles that confirm it, then the number of matches of its pair. SIFT gives one place once per dominant
+    orientation; such keypoints make tracks of their own unless a match joins them. Without the links of
+    :func:`snakesfm.tracks.split.unconfirmed_links` a track falls into parts.
 
     Parameters
     ----------
@@ -70,8 +72,7 @@ def build_tracks(
     nodes, flat = np.unique(links, return_inverse=True)
     links = flat.reshape(-1, 2).astype(np.int64)
     images = (np.searchsorted(base, nodes, side="right") - 1).astype(np.int64)
-    sound = ~unconfirmed_links(links, images)
-    links, weights = links[sound], weights[sound]
+    parts = _components(links[~unconfirmed_links(links, images)], len(nodes))
     labels = _components(links, len(nodes))
     in_conflict = _conflicting(labels, images)
     conflicts = len(np.unique(labels[in_conflict]))
@@ -83,10 +84,10 @@ def build_tracks(
         rows, sub = np.unique(links[inside], return_inverse=True)
         sub = sub.reshape(-1, 2).astype(np.int64)
         strengths = np.stack([cycle_support(sub, len(rows)), weights[inside]], axis=1)
-        parts = split_conflicts(sub, strengths, images[rows], positions[rows], merge_radius_px)
-        labels[rows] = labels.max() + 1 + parts
+        apart = split_conflicts(sub, strengths, images[rows], positions[rows], merge_radius_px)
+        labels[rows] = labels.max() + 1 + apart
     observed = _one_per_image(labels, images, np.bincount(links.ravel(), minlength=len(nodes)))
-    return _assemble(labels, images, nodes - base[images], observed, min_length, conflicts)
+    return _assemble(labels, parts, images, nodes - base[images], observed, min_length, conflicts)
 
 
 def _components(links: Array, count: int) -> Array:
@@ -117,9 +118,15 @@ def _one_per_image(labels: Array, images: Array, degrees: Array) -> Array:
 
 
 def _assemble(
-    labels: Array, images: Array, rows: Array, observed: Array, min_length: int, conflicts: int
+    labels: Array,
+    parts: Array,
+    images: Array,
+    rows: Array,
+    observed: Array,
+    min_length: int,
+    conflicts: int,
 ) -> Tracks:
-    labels, images, rows = labels[observed], images[observed], rows[observed]
+    labels, parts, images, rows = labels[observed], parts[observed], images[observed], rows[observed]
     _, first, inverse, lengths = np.unique(
         labels, return_index=True, return_inverse=True, return_counts=True
     )
@@ -130,4 +137,12 @@ def _assemble(
     order = order[np.argsort(rank[order], kind="stable")]
     starts = np.r_[True, np.diff(rank[order]) != 0][: len(order)]
     offsets = np.r_[np.nonzero(starts)[0], len(order)].astype(np.int64)
-    return Tracks(offsets, images[order].astype(np.int32), rows[order].astype(np.int32), conflicts)
+    keys = np.stack([rank[order], parts[order]], axis=1)
+    part_ids = np.unique(keys, axis=0, return_inverse=True)[1].ravel() if len(order) else order
+    return Tracks(
+        offsets,
+        images[order].astype(np.int32),
+        rows[order].astype(np.int32),
+        part_ids.astype(np.int32),
+        conflicts,
+    )

@@ -381,6 +381,7 @@ def write_former_stages(folder: Path, problem: SyntheticProblem) -> dict[str, ob
         offsets=problem.track_offsets,
         image_ids=problem.track_image_ids,
         keypoint_ids=problem.track_keypoint_ids,
+        part_ids=np.repeat(np.arange(len(problem.track_offsets) - 1), np.diff(problem.track_offsets)),
         keypoints=keypoints,
         colors=np.zeros((len(keypoints), 3), np.uint8),
     ).write(folder / "tracks.h5", HEADER)

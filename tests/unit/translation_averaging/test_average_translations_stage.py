@@ -68,6 +68,7 @@ def write_inputs(folder, truth, rotations, kinds=None, labels=None):
         offsets=truth.track_offsets,
         image_ids=truth.track_image_ids,
         keypoint_ids=truth.track_keypoint_ids,
+        part_ids=np.repeat(np.arange(len(truth.track_offsets) - 1), np.diff(truth.track_offsets)),
         keypoints=truth.track_keypoints,
         colors=np.zeros((len(truth.track_image_ids), 3), np.uint8),
     )
