@@ -153,11 +153,16 @@ def gap(key: str, groups: Mapping[Key, list[Result]], image_set: str, setting: s
 def speed(
     key: str, groups: Mapping[Key, list[Result]], image_set: str, setting: str, method: str
 ) -> tuple[float, bool] | None:
-    """How many times faster snakesfm is than ``method`` in a cost, and whether either was disturbed."""
+    """How many times faster snakesfm is than ``method`` in a cost, and whether either was disturbed.
+
+    None for the wall clock where only one of the two was left alone: that would compare loads.
+    """
     column = next(column for column in COLUMNS if column.key == key)
     ours = spread(column, groups.get((image_set, setting, OURS), []))
     other = spread(column, groups.get((image_set, setting, method), []))
     if ours is None or other is None or ours.median <= 0:
+        return None
+    if ours.disturbed != other.disturbed and "cpu" not in key:
         return None
     return other.median / ours.median, ours.disturbed or other.disturbed
 

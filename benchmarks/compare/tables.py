@@ -173,7 +173,10 @@ def _summary(sets: Mapping[str, Result], groups: Mapping[Key, list[Result]]) -> 
                 cells.append("" if difference is None else f"{difference:+.{digits}f}")
         lines.append("| " + " | ".join(cells) + " |")
     lines += ["", *_tallies(sets, groups), ""]
-    lines += ["How many times faster snakesfm is, in wall clock and in processor time.", ""]
+    lines += [
+        "How many times faster snakesfm is, in wall clock (where both or neither were disturbed) and in processor time.",
+        "",
+    ]
     titles = [f"{SHORT[setting]} vs {method} ({kind})" for setting, _, kind, method in SPEEDS]
     lines.append("| set | images | " + " | ".join(titles) + " |")
     lines.append("|---|---|" + "---|" * len(SPEEDS))
