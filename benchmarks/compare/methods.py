@@ -11,6 +11,7 @@ from pathlib import Path
 
 from benchmarks.compare.measure import ROOT, Cost, run_measured, run_operation
 from benchmarks.compare.sets import ImageSet
+from benchmarks.job_logs import DONE
 from snakesfm.artifacts import ImageIndex, TwoViewGeometries
 
 FEATURES = 5000
@@ -32,9 +33,6 @@ MAP = (
     "adjust_bundle",
 )
 STARTED = re.compile(r"^(\d{4}-\d\d-\d\dT\S+) (\w+) (?!done in )", re.M)
-ENDED = re.compile(
-    r"^(\d{4}-\d\d-\d\dT\S+) (\w+) done in [\d.]+ s, ([\d.]+) s of processor time, (\d+) MB at most$", re.M
-)
 
 
 def snakesfm(
@@ -74,11 +72,11 @@ def stage_costs(logs: Path, whole: Cost) -> dict[str, Cost]:
         ends = [
             found
             for path, text in jobs.items()
-            if path.parent.name in stages and (found := _last(ENDED, text))
+            if path.parent.name in stages and (found := _last(DONE, text))
         ]
-        until = max((_clock(found[1]) for found in ends), default=since)
-        cpu_seconds = sum(float(found[3]) for found in ends)
-        peak_mib = max((float(found[4]) for found in ends), default=0.0)
+        until = max((_clock(found["clock"]) for found in ends), default=since)
+        cpu_seconds = sum(float(found["cpu"]) for found in ends)
+        peak_mib = max((float(found["mb"]) for found in ends), default=0.0)
         costs[name] = Cost(round(until - since, 2), round(cpu_seconds, 2), peak_mib, whole.others)
         since = until
     return costs

@@ -11,13 +11,11 @@ from pathlib import Path
 import h5py
 import yaml
 
+from benchmarks.job_logs import DONE
 from snakesfm.plan import choose_blocks
 from snakesfm.simulate import Simulation, SimulationOptions
 
 ROOT = Path(__file__).resolve().parents[2]
-DONE = re.compile(
-    r"^\S+ (\w+) done in ([\d.]+) s, ([\d.]+) s of processor time, (\d+) MB at most$", re.MULTILINE
-)
 PAIRS = re.compile(r"^(\d+) pairs", re.MULTILINE)
 TILED = ("match_pairs", "estimate_two_view")
 ACCURACY = ("relative_pose_auc_1deg", "relative_pose_auc_5deg", "position_error_percent_median")
@@ -93,7 +91,7 @@ def collect(options: SimulationOptions, folder: Path) -> Measurement:
         found = DONE.findall(log.read_text("utf-8"))
         if not found:
             continue
-        stage, seconds, cpu, mb = found[-1]
+        _, stage, seconds, cpu, mb = found[-1]
         need = result.stages.setdefault(stage, StageNeed())
         artifact = scene / stage / f"{log.stem}.h5"
         if stage in TILED and artifact.is_file():

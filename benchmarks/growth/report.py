@@ -10,7 +10,8 @@ from importlib.metadata import version
 from pathlib import Path
 
 from benchmarks.growth.measure import TILED, Measurement
-from benchmarks.growth.needs import MARGIN, NEEDS, tile_pairs
+from snakesfm.plan import choose_blocks
+from snakesfm.resources import NEEDS, job_load, memory_mb
 
 # last simulated stage -> numbers of images
 WANTED = {"extract_features": (50, 200, 500, 1000, 2000), "estimate_two_view": (1000, 5000, 10_000)}
@@ -123,47 +124,47 @@ def _stages(rows: Sequence[Measurement]) -> str:
 
 
 def _needs(measurements: Sequence[Measurement]) -> str:
-    head = ["stage", "mem_mb", "runtime (minutes)", "measured / model, largest"]
     lines = []
     for stage, need in NEEDS.items():
         ratios = [
-            m.stages[stage].most_mb / need.mb(m.images, m.blocks, m.pairs)
+            m.stages[stage].most_mb / memory_mb(stage, job_load(stage, m.images, m.blocks, m.pairs))
             for m in measurements
             if stage in m.stages
         ]
-        lines.append(
-            [f"`{stage}`", need.mb_text, need.minutes_text, f"{max(ratios):.2f}" if ratios else "not run"]
-        )
+        lines.append([f"`{stage}`", need.grain, f"{max(ratios):.2f}" if ratios else "not run"])
     return f"""## What a job needs
 
-N images, B blocks, n = N/B images per block, P pairs, t = pairs in a tile, about 2P/B^2; `attempt`
-multiplies both. `mem_mb` holds a margin of {MARGIN:g}; `runtime` allows for a core several times slower.
+What jobs ask for stands in [cluster.md](cluster.md); here is how much of that memory the largest job used.
 
-{_table(head, lines)}"""
+{_table(["stage", "of", "measured / asked for"], lines)}"""
 
 
 def _future(measurements: Sequence[Measurement]) -> str:
-    images, blocks = FUTURE_IMAGES, 128
+    images = FUTURE_IMAGES
+    blocks = choose_blocks(images)
     density = statistics.median(m.pairs / m.images for m in measurements if m.images >= LEAST_IMAGES)
     pairs = int(density * images)
     cores = FUTURE_NODES * FUTURE_CORES
+    tile_pairs = job_load("match_pairs", images, blocks, pairs).pairs
     lines = []
     for stage, need in NEEDS.items():
-        cpu_hours, wall_hours, power = _hours(stage, need.parallel, measurements, images, pairs, cores)
+        parallel = need.grain != "scene"
+        cpu_hours, wall_hours, power = _hours(stage, parallel, measurements, images, pairs, cores)
         known = math.isfinite(cpu_hours)
+        asked_mb = memory_mb(stage, job_load(stage, images, blocks, pairs))
         lines.append(
             [
                 f"`{stage}`",
                 f"{cpu_hours:.2f}" if known else "not measured",
                 f"{wall_hours:.2f}" if known else "-",
                 power if known else "-",
-                f"{need.mb(images, blocks, pairs) / 1024:.1f}",
+                f"{asked_mb / 1024:.1f}",
             ]
         )
     return f"""## On paper: {images:,} images on {FUTURE_NODES} nodes of {FUTURE_CORES} cores
 
 Not run. {pairs:,} pairs ({2 * density:.0f} per image), {blocks} blocks,
-{blocks * (blocks + 1) // 2:,} tiles of about {tile_pairs(pairs, blocks):.0f} pairs.
+{blocks * (blocks + 1) // 2:,} tiles of about {tile_pairs:.0f} pairs.
 Stages that are cut into jobs have all cores; the others one core.
 Costs of the largest run are carried on with the fitted exponent p, with 1 where it is less, and with 1
 too where too few runs were made to fit one ("assumed"): such a figure is a lower bound.

@@ -18,7 +18,7 @@ from snakesfm.digests import options_digest
 from snakesfm.errors import ConfigError
 from snakesfm.front_ends import FRONT_ENDS, check_methods, fetch_command, needed_weights
 from snakesfm.ingest.discover import count_images, fingerprint_images
-from snakesfm.resources import NEEDS, Load
+from snakesfm.resources import Load, job_load
 
 # images up to which so many blocks are used: few steps, so that adding images rarely re-deals them, and so
 # few blocks that a tile takes about half a minute at the upper end of a step (docs/cluster.md)
@@ -227,13 +227,7 @@ class ScenePlan:
 
     def load(self, stage: str) -> Load:
         """What one job of a stage works on, on average over the blocks or tiles."""
-        grain = NEEDS[stage].grain
-        tiles = self.blocks * (self.blocks + 1) / 2
-        if grain == "block":
-            return Load(self.image_count / self.blocks, 0)
-        if grain == "tile":
-            return Load(min(2 / self.blocks, 1) * self.image_count, self.pair_count / tiles)
-        return Load(self.image_count, self.pair_count)
+        return job_load(stage, self.image_count, self.blocks, self.pair_count)
 
     def final_files(self) -> list[str]:
         """What a person looks at: the scene's model, its metrics and its report."""

@@ -69,6 +69,16 @@ NEEDS = {
 }
 
 
+def job_load(stage: str, images: int, blocks: int, pairs: int) -> Load:
+    """What one job of a stage works on, on average over the scene's blocks or tiles."""
+    grain = NEEDS[stage].grain
+    if grain == "block":
+        return Load(images / blocks, 0)
+    if grain == "tile":
+        return Load(min(2 / blocks, 1) * images, pairs / (blocks * (blocks + 1) / 2))
+    return Load(images, pairs)
+
+
 def memory_mb(stage: str, load: Load, attempt: int = 1) -> int:
     """Megabytes that a stage's job asks for; each further attempt asks for twice as much."""
     need = NEEDS[stage]

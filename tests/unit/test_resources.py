@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from snakesfm.config.configuration import STAGES
-from snakesfm.resources import NEEDS, Load, memory_mb, runtime_min
+from snakesfm.resources import NEEDS, Load, job_load, memory_mb, runtime_min
 
 
 def test_every_stage_has_a_need() -> None:
@@ -19,6 +19,17 @@ def test_more_work_and_further_attempts_never_ask_for_less(stage: str) -> None:
         assert 0 < ask(stage, small) <= ask(stage, large)
         assert ask(stage, large, 2) == 2 * ask(stage, large)
         assert ask(stage, large, 3) == 4 * ask(stage, large)
+
+
+@pytest.mark.parametrize("stage", STAGES)
+def test_needs_grow_with_the_scene(stage: str) -> None:
+    small, large = job_load(stage, 100, 4, 1200), job_load(stage, 10_000, 32, 120_000)
+    assert 300 <= memory_mb(stage, small) <= memory_mb(stage, large)
+    assert 10 <= runtime_min(stage, small) <= runtime_min(stage, large)
+
+
+def test_pairs_are_dealt_to_the_tiles() -> None:
+    assert job_load("match_pairs", 1000, 8, 3600) == Load(250, 100)
 
 
 @pytest.mark.parametrize("stage", STAGES)

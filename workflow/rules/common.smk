@@ -128,27 +128,22 @@ def job_command(stage):
 
 def memory_mb(stage):
     """A resource function: the memory that a job asks a cluster for."""
+    return asking(resources.memory_mb, stage)
+
+
+def runtime_min(stage):
+    """A resource function: the minutes that a job asks a cluster for."""
+    return asking(resources.runtime_min, stage)
+
+
+def asking(need, stage):
+    """A resource function of what a stage's job works on and of the attempt."""
 
     def compute(wildcards, attempt):
         # only the controller submits jobs, so only it needs the number of images
         if not workflow.is_main_process:
             return 1
-        return resources.memory_mb(
-            stage, PLAN.scenes[wildcards.scene].load(stage), attempt
-        )
-
-    return compute
-
-
-def runtime_min(stage):
-    """A resource function: the minutes that a job asks a cluster for."""
-
-    def compute(wildcards, attempt):
-        if not workflow.is_main_process:
-            return 1
-        return resources.runtime_min(
-            stage, PLAN.scenes[wildcards.scene].load(stage), attempt
-        )
+        return need(stage, PLAN.scenes[wildcards.scene].load(stage), attempt)
 
     return compute
 

@@ -13,7 +13,7 @@ from snakesfm.bundle.alignment import (
     align_observations,
     choose_templates,
 )
-from snakesfm.bundle.model import observations_of
+from snakesfm.bundle.model import observations_of, observed_keypoints
 
 Array = NDArray[Any]
 
@@ -58,10 +58,7 @@ def refine_keypoints(
     if not len(images):
         return 0, 0
     offsets = np.searchsorted(point_of, np.arange(len(points) + 1))
-    found = reconstruction.images
-    pixels = np.array(
-        [found[i + 1].point2D(k).xy for i, k in zip(images.tolist(), rows.tolist(), strict=True)]
-    )
+    pixels = observed_keypoints(reconstruction, images, rows)
     directions, sizes, tangents = _views(reconstruction, points, point_of, images, offsets)
     inside = _patch_inside(reconstruction, images, pixels, gray_scales, settings.radius_px)
     chosen = choose_templates(directions, sizes, inside, offsets)
@@ -69,6 +66,7 @@ def refine_keypoints(
         read_gray, images, pixels, tangents, chosen[point_of], inside, settings
     )
     drop = _droppable(images, aligned)
+    found = reconstruction.images
     for row in np.nonzero((moved != pixels).any(axis=1))[0].tolist():
         found[int(images[row]) + 1].point2D(int(rows[row])).xy = moved[row]
     for image, row in zip(images[drop].tolist(), rows[drop].tolist(), strict=True):

@@ -133,12 +133,17 @@ def observations_of(reconstruction: pycolmap.Reconstruction) -> tuple[Array, Arr
     return positions, np.repeat(np.arange(len(ids)), lengths), flat[:, 0] - 1, flat[:, 1]
 
 
-def observed_keypoints(reconstruction: pycolmap.Reconstruction, model: BundleModel) -> Array:
-    """Keypoints (L,2) float32 in pixels of the model's observations, as the reconstruction holds them."""
-    images = reconstruction.images
-    pairs = zip(model.image_ids.tolist(), model.keypoint_ids.tolist(), strict=True)
-    observed = [images[image + 1].point2D(row).xy for image, row in pairs]
-    return np.array(observed, dtype=np.float32).reshape(-1, 2)
+def observed_keypoints(reconstruction: pycolmap.Reconstruction, images: Array, rows: Array) -> Array:
+    """Pixels (L,2) of keypoints, as the reconstruction holds them now.
+
+    Parameters
+    ----------
+    images : (L,) image of each keypoint (row, not id).
+    rows : (L,) row of each keypoint in its image.
+    """
+    found = reconstruction.images
+    pairs = zip(images.tolist(), rows.tolist(), strict=True)
+    return np.array([found[image + 1].point2D(row).xy for image, row in pairs]).reshape(-1, 2)
 
 
 def reprojection_errors(model: BundleModel, keypoints: Array) -> Array:

@@ -94,7 +94,8 @@ def run(job: StageJob) -> None:
             f"Scene '{job.scene}': bundle adjustment kept fewer than two images: the averaged poses do not "
             "fit the tracks; check the cameras' focal lengths, or lower adjust_bundle.min_observations."
         )
-    _write(job, result, observed_keypoints(reconstruction, result), keypoints, colors, records)
+    observed = observed_keypoints(reconstruction, result.image_ids, result.keypoint_ids).astype(np.float32)
+    _write(job, result, observed, keypoints, colors, records)
 
 
 def _usable_pairs(graph: ViewGraph, model: BundleModel) -> np.ndarray:

@@ -6,9 +6,7 @@ from pathlib import Path
 import pytest
 
 from benchmarks.growth.measure import Measurement, StageNeed, collect, load, save
-from benchmarks.growth.needs import NEEDS, tile_pairs
 from benchmarks.growth.report import exponent, write_report
-from snakesfm.config.configuration import STAGES
 from snakesfm.simulate import SimulationOptions
 
 LOG = """2026-01-01T10:00:00.000 build_tracks out/build_tracks/tracks.h5
@@ -49,15 +47,6 @@ def test_small_and_single_runs_have_no_exponent() -> None:
     assert exponent([(50, 10.0), (100, 30.0)]) is None
     assert exponent([(500, 0.1), (1000, 0.2)]) is None
     assert exponent([(1000, 20.0)]) is None
-
-
-def test_every_stage_has_a_need_that_grows_with_the_scene() -> None:
-    assert set(NEEDS) == set(STAGES)
-    for need in NEEDS.values():
-        small, large = need.mb(100, 4, 1200), need.mb(10_000, 32, 120_000)
-        assert 300 <= small <= large
-        assert 10 <= need.time(100, 4, 1200) <= need.time(10_000, 32, 120_000)
-    assert tile_pairs(3200, 8) == 100
 
 
 def test_the_page_holds_all_runs_and_says_what_was_not_run(tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ from snakesfm.bundle.alignment import (
     choose_templates,
 )
 from snakesfm.bundle.keypoint_refinement import most_share_a_camera, refine_keypoints
-from snakesfm.bundle.model import BundleModel, observations_of, to_reconstruction
+from snakesfm.bundle.model import BundleModel, observations_of, observed_keypoints, to_reconstruction
 from snakesfm.geometry.camera import Camera
 from snakesfm.geometry.rotations import exp_so3
 
@@ -85,13 +85,7 @@ def model_of(scene, noise_px: float):
 def spread_px(reconstruction, pixels: np.ndarray) -> np.ndarray:
     """How far (L,) the keypoints of a point are from their true places, up to what all of them share."""
     points, point_of, images, rows = observations_of(reconstruction)
-    found = np.array(
-        [
-            reconstruction.image(i + 1).point2D(k).xy
-            for i, k in zip(images.tolist(), rows.tolist(), strict=True)
-        ]
-    )
-    offsets = found - pixels[images, rows]
+    offsets = observed_keypoints(reconstruction, images, rows) - pixels[images, rows]
     sums = np.zeros((len(points), 2))
     np.add.at(sums, point_of, offsets)
     return np.linalg.norm(offsets - (sums / np.bincount(point_of)[:, None])[point_of], axis=1)
