@@ -29,6 +29,9 @@ def parse(arguments: list[str]) -> argparse.Namespace:
     for command in (run, switch):
         command.add_argument("--data", type=Path, default=DATA, help="folder of the image sets")
         command.add_argument("--sets", nargs="*", default=[], help="names of sets (all)")
+        command.add_argument(
+            "--withhold-intrinsics", action="store_true", help="give known intrinsics to nobody"
+        )
         command.add_argument("--threads", type=int, default=os.cpu_count())
         command.add_argument(
             "--limit", type=float, default=3600, help="longest time of one command in seconds"
@@ -56,7 +59,7 @@ def main(arguments: list[str]) -> int:
     try:
         if given.command == "ablate":
             ablate(
-                read_sets(given.data, given.sets),
+                read_sets(given.data, given.sets, given.withhold_intrinsics),
                 given.options,
                 given.names,
                 given.out,
@@ -75,7 +78,7 @@ def main(arguments: list[str]) -> int:
                 given.retime,
             )
             command = describe_command(given)
-            for image_set in read_sets(given.data, given.sets):
+            for image_set in read_sets(given.data, given.sets, given.withhold_intrinsics):
                 campaign.run(image_set)
                 (given.out / "command.txt").write_text(command + "\n", "utf-8")
                 write_tables(given.out, given.page)
@@ -92,6 +95,7 @@ def describe_command(given: argparse.Namespace) -> str:
     parts += [f"--sets {shlex.join(given.sets)}"] if given.sets else []
     parts += [f"--seeds {given.seeds} --large-seeds {given.large_seeds} --threads {given.threads}"]
     parts += [f"--methods {shlex.join(given.methods)}"] if set(given.methods) != set(METHODS) else []
+    parts += ["--withhold-intrinsics"] if given.withhold_intrinsics else []
     parts += ["--retime"] if given.retime else []
     return " ".join(parts)
 

@@ -66,7 +66,9 @@ class Result:
         """The stored result of the same run with the same inputs."""
         path = self.path(folder)
         result = read_result(path) if path.is_file() else None
-        return result if result is not None and result.inputs == self.inputs else None
+        if result is None or (result.inputs, result.known) != (self.inputs, self.known):
+            return None
+        return result
 
     @property
     def undisturbed(self) -> bool:

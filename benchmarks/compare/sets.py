@@ -75,8 +75,13 @@ class ImageSet:
         return matrix
 
 
-def read_sets(data: Path, names: list[str]) -> list[ImageSet]:
+def read_sets(data: Path, names: list[str], withhold_intrinsics: bool = False) -> list[ImageSet]:
     """The named sets below ``data``, or all of them, smallest first.
+
+    Parameters
+    ----------
+    data, names : the folder of the sets, and which of them.
+    withhold_intrinsics : whether known intrinsics are given to nobody, as in a folder of photographs.
 
     Raises
     ------
@@ -90,5 +95,6 @@ def read_sets(data: Path, names: list[str]) -> list[ImageSet]:
         meta = folder / "meta.yaml"
         content = yaml.safe_load(meta.read_text("utf-8")) if meta.is_file() else {}
         truth = "colmap" not in content.get("reference_source", "colmap")
-        sets.append(ImageSet(folder.resolve(), bool(content.get("known_intrinsics", False)), truth))
+        known = bool(content.get("known_intrinsics", False)) and not withhold_intrinsics
+        sets.append(ImageSet(folder.resolve(), known, truth))
     return sorted(sets, key=lambda item: (len(item.image_names()), item.name))
