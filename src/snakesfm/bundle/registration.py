@@ -1,5 +1,6 @@
 """Registration of images that averaging left out, by their matches to points of the model."""
 
+from collections.abc import Collection
 from dataclasses import dataclass
 from typing import Any
 
@@ -22,6 +23,7 @@ def register_left_out(
     min_inliers: int,
     min_ratio: float,
     seed: int,
+    refused: Collection[int] = (),
 ) -> list[int]:
     """Register the images that have enough matches to points, most matches first, in one pass.
 
@@ -35,13 +37,14 @@ def register_left_out(
     max_error_px : largest reprojection error of an inlier.
     min_inliers, min_ratio : what a pose must have to be accepted.
     seed : of RANSAC.
+    refused : rows of images that are not tried.
 
     Returns
     -------
     Rows of the images that were registered.
     """
-    registered = set(reconstruction.reg_image_ids())
-    left_out = sorted(set(reconstruction.images) - registered)
+    settled = set(reconstruction.reg_image_ids()) | {row + 1 for row in refused}
+    left_out = sorted(set(reconstruction.images) - settled)
     if not left_out:
         return []
     observed = _ObservedKeypoints.of(reconstruction)

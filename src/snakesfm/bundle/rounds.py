@@ -157,6 +157,7 @@ class _Mapper:
         self.settings = settings
         self.report = report
         self.records: list[RoundRecord] = []
+        self.registered_late: set[int] = set()
         self.adjust = bundle_adjuster(settings.solver)
         self.completer = TrackCompleter(
             reconstruction, graph, settings.complete_error_px, settings.min_angle_deg, settings.seed
@@ -237,7 +238,10 @@ class _Mapper:
         return settings.loss_scale_sigmas * keypoint_noise_px(self.reconstruction)
 
     def register(self) -> bool:
-        """Register what can be; whether something was."""
+        """Register what can be; whether something was.
+
+        An image that the adjustment throws out again is not tried twice, or that would go on for ever.
+        """
         settings = self.settings
         done = register_left_out(
             self.reconstruction,
@@ -246,7 +250,9 @@ class _Mapper:
             settings.register_min_inliers,
             settings.register_min_ratio,
             settings.seed,
+            self.registered_late,
         )
+        self.registered_late.update(done)
         if done:
             self.completer(done)
         return bool(done)

@@ -23,6 +23,7 @@ from snakesfm.geometry.poses import translation_of
 from snakesfm.geometry.rotations import angle_of
 from snakesfm.synthetic.problems import make_problem, perturb_rotations
 
+SEEN = 24
 NAMES = [f"{k}.jpg" for k in range(12)]
 
 
@@ -244,6 +245,19 @@ def test_left_out_images_get_a_last_round():
     assert np.isfinite(result.rotations).all()
     stays, _ = run_rounds(made, perturbed(made, left_out=[6]), register_images=False)
     assert np.isnan(stays.rotations[6]).all()
+
+
+def test_an_image_that_is_thrown_out_again_is_registered_once():
+    made = problem()
+    side = np.repeat(made.pairs, np.diff(made.match_offsets), axis=0)
+    few = ((side != 6) | (made.matches < SEEN)).all(axis=1)
+    pair_of = np.repeat(np.arange(len(made.pairs)), np.diff(made.match_offsets))
+    counts = np.bincount(pair_of[few], minlength=len(made.pairs))
+    made = replace(made, matches=made.matches[few], match_offsets=np.r_[0, np.cumsum(counts)])
+    limits = {"register_min_inliers": 6, "min_observations": SEEN}
+    result, records = run_rounds(made, perturbed(made, left_out=[6]), **limits)
+    assert [record.name for record in records].count("registration") == 1
+    assert np.isnan(result.rotations[6]).all() and records[-1].counts[0] == 11
 
 
 def test_rounds_are_deterministic():
