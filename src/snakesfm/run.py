@@ -162,6 +162,8 @@ class Run:
             database = Path(scene.database_file())
             made = f"COLMAP database in {database}, " if database.is_file() else ""
             return f"snakesfm: scene '{scene.name}': {made}no model yet."
+        others = summary.get("images_in_other_models", [])
+        more = f" and {sum(others)} in {len(others)} models beside" if others else ""
         accuracy = ""
         with contextlib.suppress(OSError, ValueError, KeyError):
             metrics = json.loads((scene.folder / "evaluate_model" / "metrics.json").read_text("utf-8"))
@@ -169,7 +171,7 @@ class Run:
             accuracy = f", relative-pose AUC {'/'.join(areas)} at 1/3/5 deg"
         return (
             f"snakesfm: scene '{scene.name}': {summary['registered_images']} of {summary['images']} images "
-            f"registered, {summary['points']} points, mean reprojection error "
+            f"registered{more}, {summary['points']} points, mean reprojection error "
             f"{summary['mean_reprojection_error_px']:.3f} px{accuracy}, "
             f"{time.time() - self.started:.0f} s; model in {path.parent / 'sparse' / '0'}"
         )

@@ -1,7 +1,9 @@
 """Artifacts of the averagings, the tracks and the bundle adjustment."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
+
+import numpy as np
 
 from snakesfm.artifacts.base import Array, Artifact, column
 
@@ -11,10 +13,12 @@ class CameraRotations(Artifact):
     """Averaged rotations."""
 
     kind: ClassVar[str] = "camera_rotations"
+    format_version: ClassVar[int] = 2
 
     rotations: Array = column("(N,3,3)", "float64", "cam_from_world; NaN where the image has none")
     residuals_deg: Array = column("(E)", "float64", "per edge of the view graph, NaN where not compared")
     labels: Array = column("(E)", "int8", "label of the edge after averaging, as in view_graph")
+    components: Array = column("(N)", "int32", "images of one share a world; 0 the largest, -1 none")
 
 
 @dataclass(frozen=True)
@@ -64,12 +68,14 @@ class Reconstruction(Artifact):
     """The adjusted model: cameras, poses, points and observations."""
 
     kind: ClassVar[str] = "reconstruction"
+    format_version: ClassVar[int] = 2
 
     camera_models: Array = column("(C)", "str", "COLMAP camera model name")
     camera_sizes: Array = column("(C,2)", "int32", "width and height in pixels")
     camera_params: Array = column("(C,12)", "float64", "COLMAP parameters in pixels, padded with NaN")
     rotations: Array = column("(N,3,3)", "float64", "cam_from_world; NaN where not registered")
     translations: Array = column("(N,3)", "float64", "cam_from_world; NaN where not registered")
+    models: Array = column("(N)", "int32", "images of one share a world; 0 the largest, -1 none")
     points: Array = column("(T,3)", "float64", "point in the world")
     colors: Array = column("(T,3)", "uint8", "mean RGB of the observations")
     errors_px: Array = column("(T)", "float64", "mean reprojection error of the point")
@@ -81,3 +87,29 @@ class Reconstruction(Artifact):
     round_costs: Array = column("(B,2)", "float64", "robust cost before and after the round")
     round_counts: Array = column("(B,3)", "int64", "images, points and observations after the round")
     round_errors_px: Array = column("(B)", "float64", "mean reprojection error after the round")
+
+    @property
+    def model_count(self) -> int:
+        """How many models there are, each in a world of its own."""
+        return int(self.models.max(initial=-1)) + 1
+
+    def select_model(self, number: int) -> "Reconstruction":
+        """The poses, points and observations of one model alone; cameras and rounds stay as they are."""
+        mine = self.models == number
+        # a point is seen by images of one model only
+        points = mine[self.image_ids[self.offsets[:-1]]]
+        lengths = np.diff(self.offsets)
+        rows = np.repeat(points, lengths)
+        return replace(
+            self,
+            rotations=np.where(mine[:, None, None], self.rotations, np.nan),
+            translations=np.where(mine[:, None], self.translations, np.nan),
+            models=np.where(mine, self.models, -1),
+            points=self.points[points],
+            colors=self.colors[points],
+            errors_px=self.errors_px[points],
+            offsets=np.r_[0, np.cumsum(lengths[points])].astype(np.int64),
+            image_ids=self.image_ids[rows],
+            keypoint_ids=self.keypoint_ids[rows],
+            keypoints=self.keypoints[rows],
+        )

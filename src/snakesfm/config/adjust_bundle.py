@@ -10,7 +10,7 @@ from snakesfm.config.base import StageOptions
 class AdjustBundleOptions(StageOptions):
     """How cameras, poses and points are adjusted together."""
 
-    stage_version: ClassVar[int] = 7
+    stage_version: ClassVar[int] = 8
 
     solver: Literal["ceres", "gtsam"] = "ceres"
     """Least-squares solver: Ceres through pycolmap, or gtsam (slower, fewer camera models)."""

@@ -10,7 +10,7 @@ from snakesfm.config.base import StageOptions
 class AverageRotationsOptions(StageOptions):
     """Options of averaging relative rotations to absolute ones."""
 
-    stage_version: ClassVar[int] = 2
+    stage_version: ClassVar[int] = 3
 
     method: Literal["two_stage", "irls", "shonan"] = "two_stage"
     """Averager: robust pass and covariance-weighted refinement, L1 and IRLS only, or Shonan averaging."""
@@ -23,3 +23,6 @@ class AverageRotationsOptions(StageOptions):
 
     passes: int = Field(default=2, ge=1, le=5)
     """How often the rotations are averaged; then edges are refused or taken back by residuals."""
+
+    min_component_images: int = Field(default=5, ge=2)
+    """Images that a part of the view graph needs to become a model of its own beside the largest part."""

@@ -10,7 +10,7 @@ from snakesfm.config.base import StageOptions
 class FilterViewGraphOptions(StageOptions):
     """Options of refusing edges of the view graph that contradict the others."""
 
-    stage_version: ClassVar[int] = 2
+    stage_version: ClassVar[int] = 3
 
     method: Literal["message_passing", "cycles"] = "message_passing"
     """How 3-cycles refuse edges: by message passing between them, or by the paper's two passes."""

@@ -76,26 +76,26 @@ def build_reconstruction(
 def summarize(
     scene: str,
     names: Sequence[str],
-    registered: Array,
+    models: Array,
     offsets: Array,
     errors_px: Array,
     warnings: Sequence[str],
 ) -> Mapping[str, Any]:
-    """What summary.json says of the model.
+    """What summary.json says of the first model.
 
     Parameters
     ----------
-    registered : rows (n,) of the registered images.
+    models : (N,) model of each image, 0 the first; -1 where it has no pose.
     offsets, errors_px : (T+1,) and (T,): observations and mean reprojection error of the points.
     """
     lengths = np.diff(offsets)
     observations = int(lengths.sum())
-    missing = sorted(set(range(len(names))) - set(registered.tolist()))
     return {
         "scene": scene,
         "images": len(names),
-        "registered_images": len(registered),
-        "not_registered": [names[row] for row in missing],
+        "registered_images": int(np.count_nonzero(models == 0)),
+        "images_in_other_models": np.bincount(models[models > 0])[1:].tolist(),
+        "not_registered": [names[row] for row in np.flatnonzero(models < 0).tolist()],
         "points": len(lengths),
         "observations": observations,
         "mean_track_length": observations / len(lengths) if len(lengths) else 0.0,

@@ -23,9 +23,14 @@ class ImageCounts:
     rotated: Array
     track_observations: Array
     point_observations: Array
-    registered: Array
+    models: Array
     observations: Array
     mean_error_px: Array
+
+    @property
+    def registered(self) -> Array:
+        """Which images are in the first model."""
+        return np.asarray(self.models == 0)
 
 
 def count_by_image(ids: Array, count: int) -> Array:
@@ -97,6 +102,9 @@ def reason_not_registered(
         return f"None of its {counts.pairs[image]} pairs was accepted: {_listed(rejections)}."
     if counts.kept[image] == 0:
         return f"All its {counts.accepted[image]} view-graph edges were refused: {_listed(edge_labels)}."
+    if counts.models[image] > 0:
+        size = int(np.sum(counts.models == counts.models[image]))
+        return f"It is in a model of its own of {size} images, in sparse/{counts.models[image]}."
     if counts.components[image] != 0:
         size = int(np.sum(counts.components == counts.components[image]))
         return f"It is in a component of {size} images that is not connected to the largest one."

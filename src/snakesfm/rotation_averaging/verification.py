@@ -10,9 +10,58 @@ from snakesfm.rotation_averaging.base import RotationAverager, RotationGraph, ed
 from snakesfm.rotation_averaging.irls import IrlsAverager
 from snakesfm.rotation_averaging.moves import SEARCH_DEGREE, improve_rotations
 from snakesfm.rotation_averaging.rejection import residual_limit
+from snakesfm.view_graph.components import label_components
 from snakesfm.view_graph.filters import keep_largest_component
 
 Array = NDArray[Any]
+
+
+def average_components(
+    averager: RotationAverager,
+    graph: RotationGraph,
+    reasons: Array,
+    smallest_limit_deg: float,
+    largest_limit_deg: float,
+    passes: int,
+    min_images: int,
+    seed: int,
+) -> tuple[Array, Array, Array]:
+    """Average the largest component of the kept edges, then of what that leaves the largest, and so on.
+
+    What the judging of edges cuts off a component may so become one of its own.
+
+    Parameters
+    ----------
+    graph, reasons, smallest_limit_deg, largest_limit_deg, passes : as of :func:`average_view_graph`.
+    min_images : images that a component must have; the first needs two.
+
+    Returns
+    -------
+    rotations : (N,3,3) cam_from_world, each component in a world of its own, NaN where there is none.
+    reasons : (E,) str; ``rotation_residual`` and ``component`` where refused here.
+    components : (N,) int32 of the images that have a rotation, 0 the first; -1 for others.
+    """
+    limits = (smallest_limit_deg, largest_limit_deg, passes, seed)
+    rotations = np.full((graph.node_count, 3, 3), np.nan)
+    components = np.full(graph.node_count, -1, dtype=np.int32)
+    judged = np.where(reasons == "kept", "component", reasons).astype(object)
+    tried = np.zeros(graph.node_count, dtype=bool)
+    while True:
+        open_edges = ~tried[graph.pairs].any(axis=1)
+        largest = label_components(graph.node_count, graph.pairs[open_edges & (reasons == "kept")]) == 0
+        if np.count_nonzero(largest) < (min_images if tried.any() else 2):
+            return rotations, judged, components
+        inside = largest[graph.pairs].all(axis=1)
+        numbers = np.cumsum(largest) - 1
+        part = graph.subset(inside)
+        part = replace(part, node_count=int(largest.sum()), pairs=numbers[part.pairs])
+        averaged, left, labels = average_view_graph(averager, part, reasons[inside], *limits)
+        images = np.flatnonzero(largest)[labels == 0]
+        if len(images) >= min_images or not tried.any():
+            rotations[images] = averaged[labels == 0]
+            judged[inside] = left
+            components[images] = components.max() + 1
+        tried[images] = True
 
 
 def average_view_graph(
@@ -31,7 +80,7 @@ def average_view_graph(
 
     Parameters
     ----------
-    graph : all N images and E edges; need not be connected.
+    graph : all N images and E edges, of which the kept ones connect all.
     reasons : (E,) str, ``kept`` or what refused an edge.
     smallest_limit_deg, largest_limit_deg : bounds of the residual above which an edge is refused.
     passes : how often is averaged, at most, and edges judged after it.

@@ -1,5 +1,6 @@
 """Stage adjust_bundle: cameras, poses and points adjusted together."""
 
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -21,6 +22,7 @@ from snakesfm.bundle.model import (
     reprojection_errors,
     to_reconstruction,
 )
+from snakesfm.bundle.models import join_models, registered_in, restrict_to
 from snakesfm.bundle.rounds import (
     ImageSource,
     RoundRecord,
@@ -38,70 +40,114 @@ if TYPE_CHECKING:
     from snakesfm.config.adjust_bundle import AdjustBundleOptions
 
 KEPT_IMAGES = 256
+SMALLEST_FURTHER_MODEL = 3
 
 
 def run(job: StageJob) -> None:
-    """Adjust the model in rounds and write the reconstruction.
+    """Adjust each component's model in rounds and write all of them, the one with most images first.
 
     Raises
     ------
     SceneError : fewer than two images are left.
     """
-    options: AdjustBundleOptions = job.options
     index = ImageIndex.read(job.path("index"))
     columns = CalibratedCameras.read(job.path("cameras"))
-    cameras = cameras_from_columns(columns.models, columns.sizes, columns.params, columns.sources)
-    rotations = CameraRotations.read(job.path("rotations")).rotations
+    averaged = CameraRotations.read(job.path("rotations"))
     centers = CameraCenters.read(job.path("centers")).centers
     start = TriangulatedPoints.read(job.path("points"))
     keypoints, colors = gather_image_columns(job.paths("features"), len(index.names), "keypoints", "colors")
     model = BundleModel(
-        tuple(cameras),
+        tuple(cameras_from_columns(columns.models, columns.sizes, columns.params, columns.sources)),
         index.camera_ids,
-        rotations,
-        translation_of(rotations, centers),
+        averaged.rotations,
+        translation_of(averaged.rotations, centers),
         start.points,
         start.offsets,
         start.image_ids,
         start.keypoint_ids,
     )
+    graph = ViewGraph.read(job.path("graph"))
+    cameras, taken = model.cameras, np.zeros(len(index.names), dtype=bool)
+    adjusted: list[tuple[BundleModel, np.ndarray]] = []
+    records: list[RoundRecord] = []
+    for component in range(int(averaged.components.max(initial=0)) + 1):
+        part = restrict_to(replace(model, cameras=cameras), (averaged.components == component) & ~taken)
+        if component and registered_in(part).sum() < SMALLEST_FURTHER_MODEL:
+            continue
+        prefix = f"part {component + 1}, " if component else ""
+        result, observed, rounds = _adjust(job, index, part, graph, keypoints, taken, prefix)
+        records += rounds
+        cameras = result.cameras
+        if registered_in(result).sum() >= 2:
+            adjusted.append((result, observed))
+            taken |= registered_in(result)
+    if not adjusted:
+        raise SceneError(
+            f"Scene '{job.scene}': bundle adjustment kept fewer than two images: the averaged poses do not "
+            "fit the tracks; check the cameras' focal lengths, or lower adjust_bundle.min_observations."
+        )
+    adjusted.sort(key=lambda found: -registered_in(found[0]).sum())
+    joined, models = join_models([found for found, _ in adjusted], cameras)
+    pixels = np.concatenate([observed for _, observed in adjusted])
+    _write(job, joined, models, pixels, keypoints, colors, records)
+
+
+def _adjust(
+    job: StageJob,
+    index: ImageIndex,
+    model: BundleModel,
+    view_graph: ViewGraph,
+    keypoints: list[np.ndarray],
+    taken: np.ndarray,
+    prefix: str,
+) -> tuple[BundleModel, np.ndarray, list[RoundRecord]]:
+    """One component's model adjusted, its observed keypoints (L,2) float32, and its rounds.
+
+    Parameters
+    ----------
+    model : poses and points to start from.
+    taken : (N,) bool, images of other models: they stay where they are, and so do their cameras.
+    prefix : goes before the names of the rounds.
+    """
+    options: AdjustBundleOptions = job.options
     reconstruction = to_reconstruction(model, keypoints, index.names.tolist())
-    pairs = _usable_pairs(ViewGraph.read(job.path("graph")), model)
+    pairs = _usable_pairs(view_graph, model)
+    pairs = pairs[~taken[pairs].any(axis=1)]
     graph = correspondence_graph(keypoints, *gather_inlier_matches(job.paths("geometries"), pairs))
     fixed = job.settings.get("intrinsics", "fixed") == "fixed"
+    held = {row for row, camera in enumerate(model.cameras) if fixed and camera.source == "given"}
+    held |= set(model.camera_ids[taken].tolist())
     solving = SolverSettings(
         loss=options.loss,
-        constant_cameras=frozenset(
-            row + 1 for row, camera in enumerate(cameras) if fixed and camera.source == "given"
-        ),
+        constant_cameras=frozenset(row + 1 for row in held),
         refine_focal=options.refine_focal,
         refine_distortion=options.refine_distortion,
         max_iterations=options.max_iterations,
         function_tolerance=options.function_tolerance,
     )
     shared = options.model_dump(include=set(RoundSettings.__dataclass_fields__))
-    posed = int(np.isfinite(model.rotations[:, 0, 0] + model.translations[:, 0]).sum())
-    shared["min_track_length"] = min(options.min_track_length, max(2, posed))
+    shared["min_track_length"] = min(options.min_track_length, max(2, int(registered_in(model).sum())))
     settings = RoundSettings(**shared, seed=job.seed_for("bundle"))
     refines = options.refine_keypoints
     if refines == "auto":
         refines = most_share_a_camera(index.camera_ids)
     source = _image_source(job, index) if refines else None
-    records = adjust_rounds(reconstruction, graph, cameras, solving, settings, _print_record, source)
+    reported: list[RoundRecord] = []
+
+    def report(record: RoundRecord) -> None:
+        reported.append(replace(record, name=prefix + record.name))
+        _print_record(reported[-1])
+
+    adjust_rounds(reconstruction, graph, model.cameras, solving, settings, report, source)
     result = from_reconstruction(reconstruction, model)
-    if np.isfinite(result.rotations[:, 0, 0]).sum() < 2:
-        raise SceneError(
-            f"Scene '{job.scene}': bundle adjustment kept fewer than two images: the averaged poses do not "
-            "fit the tracks; check the cameras' focal lengths, or lower adjust_bundle.min_observations."
-        )
-    observed = observed_keypoints(reconstruction, result.image_ids, result.keypoint_ids).astype(np.float32)
-    _write(job, result, observed, keypoints, colors, records)
+    observed = observed_keypoints(reconstruction, result.image_ids, result.keypoint_ids)
+    return result, observed.astype(np.float32), reported
 
 
 def _usable_pairs(graph: ViewGraph, model: BundleModel) -> np.ndarray:
     """Edges that the filters kept, and all edges of images that averaging left out."""
-    posed = np.isfinite(model.rotations[:, 0, 0]) & np.isfinite(model.translations[:, 0])
-    usable: np.ndarray = graph.pairs[(graph.labels == 0) | ~posed[graph.pairs].all(axis=1)]
+    posed = registered_in(model)[graph.pairs].all(axis=1)
+    usable: np.ndarray = graph.pairs[(graph.labels == 0) | ~posed]
     return usable
 
 
@@ -150,6 +196,7 @@ def _print_record(record: RoundRecord) -> None:
 def _write(
     job: StageJob,
     model: BundleModel,
+    models: np.ndarray,
     observed: np.ndarray,
     keypoints: list[np.ndarray],
     colors: list[np.ndarray],
@@ -157,13 +204,14 @@ def _write(
 ) -> None:
     base = np.r_[0, np.cumsum([len(k) for k in keypoints])]
     rows = base[model.image_ids] + model.keypoint_ids
-    models, sizes, params, _ = cameras_to_columns(model.cameras)
+    camera_models, sizes, params, _ = cameras_to_columns(model.cameras)
     Reconstruction(
-        camera_models=np.array(models),
+        camera_models=np.array(camera_models),
         camera_sizes=sizes,
         camera_params=params,
         rotations=model.rotations,
         translations=model.translations,
+        models=models,
         points=model.points,
         colors=mean_colors(np.concatenate(colors)[rows], model.offsets),
         errors_px=mean_point_errors(reprojection_errors(model, observed), model.offsets),

@@ -11,7 +11,7 @@ from snakesfm.artifacts.pairs import EDGE_LABELS, ViewGraph
 from snakesfm.errors import SceneError
 from snakesfm.rotation_averaging.base import RotationGraph, edge_residuals
 from snakesfm.rotation_averaging.registry import make_averager
-from snakesfm.rotation_averaging.verification import average_view_graph
+from snakesfm.rotation_averaging.verification import average_components
 from snakesfm.stages.job import StageJob
 
 if TYPE_CHECKING:
@@ -43,13 +43,14 @@ def run(job: StageJob) -> None:
         graph.covariances[:, :3, :3],
     )
     filtered = reasons == "kept"
-    rotations, reasons, components = average_view_graph(
+    rotations, reasons, components = average_components(
         make_averager(options.method),
         whole,
         reasons,
         options.min_residual_deg,
         options.max_residual_deg,
         options.passes,
+        options.min_component_images,
         job.seed_for(),
     )
     residuals = np.degrees(edge_residuals(graph.pairs, graph.rotations, rotations))
@@ -57,10 +58,13 @@ def run(job: StageJob) -> None:
         rotations=rotations,
         residuals_deg=residuals,
         labels=np.array([EDGE_LABELS.index(reason) for reason in reasons], dtype=np.int8),
+        components=components,
     ).write(job.output, job.header)
     kept = reasons == "kept"
+    others = np.count_nonzero(components > 0)
+    more = f" and {others} in {components.max()} components beside" if others else ""
     print(
-        f"average_rotations: {np.count_nonzero(components == 0)} of {image_count} images,"
+        f"average_rotations: {np.count_nonzero(components == 0)} of {image_count} images{more},"
         f" {np.count_nonzero(kept)} edges with a median residual of {np.median(residuals[kept]):.2f} deg,"
         f" {np.count_nonzero(kept & ~filtered)} of them had been refused before",
         file=sys.stderr,

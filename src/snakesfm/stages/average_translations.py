@@ -11,7 +11,7 @@ from snakesfm.artifacts.pairs import KINDS, ViewGraph
 from snakesfm.errors import SceneError
 from snakesfm.geometry.camera import cameras_from_columns
 from snakesfm.stages.job import StageJob
-from snakesfm.translation_averaging.average import average_translations
+from snakesfm.translation_averaging.average import average_components
 from snakesfm.translation_averaging.averagers import (
     GlobalPositioning,
     ScaleChain,
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 
 def run(job: StageJob) -> None:
-    """Position the images that have a rotation.
+    """Position the images that have a rotation, each component of them in a world of its own.
 
     Edges take part that every filter kept and whose translation has a direction; rays of the tracks take
     part as far as ``rays_per_camera`` allows.
@@ -76,8 +76,9 @@ def run(job: StageJob) -> None:
         min_ratio=options.min_support_ratio,
         max_relative_sigma=options.max_relative_sigma,
     )
-    result = average_translations(
+    result = average_components(
         problem,
+        averaged.components,
         _averager(options),
         limits,
         refine=options.refine,

@@ -1,7 +1,9 @@
-"""evaluate_model: the model's metrics, against a reference where there is one."""
+"""evaluate_model: the metrics of the largest model, against a reference where there is one."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from snakesfm.artifacts import ImageIndex, Reconstruction, atomic_path, write_json
 from snakesfm.evaluation.metrics import PoseEvaluation, Poses, evaluate_poses, model_metrics
@@ -14,10 +16,12 @@ if TYPE_CHECKING:
 def run(job: StageJob) -> None:
     """Write metrics.json and, where it is among the outputs, its scalars as one row of metrics.csv."""
     index = ImageIndex.read(job.path("index"))
-    model = Reconstruction.read(job.path("reconstruction"))
+    adjusted = Reconstruction.read(job.path("reconstruction"))
+    model = adjusted.select_model(0)
     poses = Poses([str(name) for name in index.names], model.rotations, model.translations)
     row: dict[str, Any] = {"scene": job.scene}
     row |= model_metrics(poses.registered, model.offsets, model.errors_px)
+    row["images_in_other_models"] = int(np.count_nonzero(adjusted.models > 0))
     content: dict[str, Any] = dict(row)
     reference = str(job.settings.get("reference") or "")
     if reference:

@@ -7,15 +7,19 @@ import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from snakesfm.artifacts import ImageIndex, Reconstruction
 from snakesfm.export.colmap import build_reconstruction, registered_images, summarize
 from snakesfm.export.image_folder import place_images
 from snakesfm.export.nerfstudio import camera_warnings, transforms
 from snakesfm.export.undistorted import write_undistorted
-from snakesfm.geometry.camera import cameras_from_columns
+from snakesfm.geometry.camera import Camera, cameras_from_columns
 from snakesfm.stages.job import StageJob
 
 if TYPE_CHECKING:
+    import pycolmap
+
     from snakesfm.config.export_model import ExportModelOptions
 
 SUMMARY = "summary.json"
@@ -25,11 +29,17 @@ SPACES = (
     "Some image names hold spaces, at which COLMAP cuts names when it reads images.txt: use the .bin files."
 )
 
+OTHER_MODELS = (
+    "{images} images have no tie to the others: each part of them is a model of its own, in a world of its "
+    "own, in a folder beside sparse/0 ({count} in number)."
+)
+
 
 def run(job: StageJob) -> None:
     """Write the files that ``job.outputs`` names, complete or not at all, summary.json last."""
     index = ImageIndex.read(job.path("index"))
-    model = Reconstruction.read(job.path("reconstruction"))
+    adjusted = Reconstruction.read(job.path("reconstruction"))
+    model = adjusted.select_model(0)
     cameras = cameras_from_columns(model.camera_models, model.camera_sizes, model.camera_params)
     names = [str(name) for name in index.names]
     registered = registered_images(model.rotations, model.translations)
@@ -37,6 +47,9 @@ def run(job: StageJob) -> None:
     warnings = [line for row in used for line in camera_warnings(cameras[row], row + 1)]
     if any(" " in names[row] for row in registered):
         warnings.append(SPACES)
+    others = np.bincount(adjusted.models[adjusted.models > 0])[1:].tolist()
+    if others:
+        warnings.append(OTHER_MODELS.format(images=sum(others), count=len(others)))
     for line in warnings:
         sys.stderr.write(f"warning: {line}\n")
     folder = _export_folder(job)
@@ -45,37 +58,48 @@ def run(job: StageJob) -> None:
         shutil.rmtree(leftover)
     with tempfile.TemporaryDirectory(prefix=TEMPORARY, dir=folder) as name:
         temporary = Path(name)
-        sparse = temporary / "sparse" / "0"
-        sparse.mkdir(parents=True)
-        colmap = build_reconstruction(
-            names,
-            index.camera_ids,
-            cameras,
-            model.rotations,
-            model.translations,
-            model.points,
-            model.colors,
-            model.errors_px,
-            model.offsets,
-            model.image_ids,
-            model.keypoints,
-        )
-        colmap.write_binary(str(sparse))
-        colmap.write_text(str(sparse))
-        colmap.export_PLY(str(temporary / "points.ply"))
+        sparse = temporary / "sparse"
+        for number in range(max(1, adjusted.model_count)):
+            folder_of = sparse / str(number)
+            folder_of.mkdir(parents=True)
+            colmap = _build(names, index, cameras, adjusted.select_model(number))
+            colmap.write_binary(str(folder_of))
+            colmap.write_text(str(folder_of))
+            if number == 0:
+                colmap.export_PLY(str(temporary / "points.ply"))
         content = transforms(
             names, index.camera_ids, cameras, model.rotations, model.translations, registered
         )
         _write_json(temporary / "transforms.json", content)
-        summary = summarize(job.scene, names, registered, model.offsets, model.errors_px, warnings)
+        summary = summarize(job.scene, names, adjusted.models, model.offsets, model.errors_px, warnings)
         _write_json(temporary / SUMMARY, summary)
         options: ExportModelOptions = job.options
         if options.link_images or options.undistort:
             place_images(folder / "images", Path(job.settings["images"]), names, index.orientations)
         if options.undistort:
-            write_undistorted(temporary / UNDISTORTED, sparse, folder / "images", job.threads)
+            write_undistorted(temporary / UNDISTORTED, sparse / "0", folder / "images", job.threads)
         shutil.rmtree(folder / UNDISTORTED, ignore_errors=True)
+        for former in (folder / "sparse").glob("[1-9]*"):
+            shutil.rmtree(former)
         _publish(temporary, folder)
+
+
+def _build(
+    names: list[str], index: ImageIndex, cameras: list[Camera], model: Reconstruction
+) -> "pycolmap.Reconstruction":
+    return build_reconstruction(
+        names,
+        index.camera_ids,
+        cameras,
+        model.rotations,
+        model.translations,
+        model.points,
+        model.colors,
+        model.errors_px,
+        model.offsets,
+        model.image_ids,
+        model.keypoints,
+    )
 
 
 def _export_folder(job: StageJob) -> Path:

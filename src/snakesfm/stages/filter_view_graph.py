@@ -9,13 +9,9 @@ import numpy as np
 from snakesfm.artifacts.images import ImageIndex
 from snakesfm.artifacts.pairs import EDGE_LABELS, ViewGraph
 from snakesfm.stages.job import StageJob
+from snakesfm.view_graph.components import label_components
 from snakesfm.view_graph.cycles import find_cycles, median_of
-from snakesfm.view_graph.filters import (
-    keep_largest_component,
-    refuse_by_cycles,
-    refuse_by_messages,
-    vote_between_clusters,
-)
+from snakesfm.view_graph.filters import refuse_by_cycles, refuse_by_messages, vote_between_clusters
 
 if TYPE_CHECKING:
     from snakesfm.config.filter_view_graph import FilterViewGraphOptions
@@ -45,7 +41,7 @@ def run(job: StageJob) -> None:
             options.min_cluster_inliers,
             np.radians(options.vote_tolerance_deg),
         )
-    reasons, components = keep_largest_component(image_count, graph.pairs, reasons)
+    components = label_components(image_count, graph.pairs[reasons == "kept"])
     labels = np.array([EDGE_LABELS.index(reason) for reason in reasons], dtype=np.int8)
     dataclasses.replace(
         graph,

@@ -51,7 +51,8 @@ class Pairs:
 def run(job: StageJob) -> None:
     """Write index.html."""
     index = ImageIndex.read(job.path("index"))
-    model = Reconstruction.read(job.path("reconstruction"))
+    adjusted = Reconstruction.read(job.path("reconstruction"))
+    model = adjusted.select_model(0)
     graph = ViewGraph.read(job.path("graph"))
     rotations = CameraRotations.read(job.path("rotations"))
     pairs = _read_pairs(job.paths("geometries"))
@@ -83,7 +84,7 @@ def run(job: StageJob) -> None:
         rotated=np.asarray(np.isfinite(rotations.rotations).all(axis=(1, 2))),
         track_observations=count_by_image(tracks["image_ids"], count),
         point_observations=count_by_image(points["image_ids"], count),
-        registered=np.asarray(np.isfinite(model.rotations).all(axis=(1, 2))),
+        models=adjusted.models,
         observations=count_by_image(model.image_ids, count),
         mean_error_px=mean_by_image(errors, model.image_ids, count),
     )

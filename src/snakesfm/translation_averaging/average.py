@@ -29,6 +29,40 @@ class AveragedCenters:
     """(Q)."""
 
 
+def average_components(
+    problem: PositioningProblem,
+    components: Array,
+    averager: TranslationAverager,
+    limits: SupportLimits,
+    *,
+    refine: bool = True,
+    rays_per_camera: int = 100,
+    edge_weight: float = 0.1,
+    seed: int = 0,
+) -> AveragedCenters:
+    """Position the cameras of each component (N,) of the images, -1 for none, in a world of its own."""
+    centers = np.full((problem.image_count, 3), np.nan)
+    edge_residuals = np.full(len(problem.pairs), np.nan)
+    rays = []
+    for component in range(max(1, int(components.max(initial=-1)) + 1)):
+        mine = components == component
+        edges = mine[problem.pairs].all(axis=1)
+        found = average_translations(
+            problem.select_edges(edges).select_rays(mine[problem.ray_images]),
+            averager,
+            limits,
+            refine=refine,
+            rays_per_camera=rays_per_camera,
+            edge_weight=edge_weight,
+            seed=seed,
+        )
+        centers[mine] = found.centers[mine]
+        edge_residuals[edges] = found.edge_residuals_rad
+        rays.append((found.ray_tracks, found.ray_residuals_rad))
+    tracks, residuals = (np.concatenate(column) for column in zip(*rays, strict=True))
+    return AveragedCenters(centers, edge_residuals, tracks, residuals)
+
+
 def average_translations(
     problem: PositioningProblem,
     averager: TranslationAverager,

@@ -94,6 +94,7 @@ def write_reconstruction(folder: Path, problem: SyntheticProblem, lost: Iterable
         camera_params=params,
         rotations=rotations,
         translations=translations,
+        models=np.where(np.isin(np.arange(COUNT), list(lost)), -1, 0),
         points=problem.points[seen],
         colors=np.arange(count * 3).reshape(-1, 3).astype(np.uint8),
         errors_px=np.linspace(0.1, 0.5, count),
@@ -375,6 +376,7 @@ def write_former_stages(folder: Path, problem: SyntheticProblem) -> dict[str, ob
         rotations=rotations,
         residuals_deg=np.full(kept.sum(), 0.25),
         labels=np.zeros(kept.sum(), np.int8),
+        components=np.where(np.arange(COUNT) == LOST, -1, 0),
     ).write(folder / "rotations.h5", HEADER)
     keypoints = problem.track_keypoints
     TrackTable(

@@ -33,7 +33,7 @@ def counts(**changes: object) -> ImageCounts:
         "rotated": [True] * 3,
         "track_observations": [9, 9, 9],
         "point_observations": [8, 8, 8],
-        "registered": [False, True, True],
+        "models": [-1, 0, 0],
         "observations": [0, 7, 2],
         "mean_error_px": [np.nan, 0.5, 0.6],
     } | changes
@@ -54,7 +54,8 @@ def counts(**changes: object) -> ImageCounts:
         ({"track_observations": [0, 9, 9]}, "No track"),
         ({"point_observations": [0, 8, 8]}, "triangulated"),
         ({}, "Bundle adjustment dropped it"),
-        ({"registered": [True] * 3}, ""),
+        ({"models": [1, 0, 0], "components": [1, 0, 0]}, "model of its own of 1 images, in sparse/1"),
+        ({"models": [0, 0, 0]}, ""),
     ],
 )
 def test_the_reason_names_the_first_step_that_lost_the_image(changes, expected) -> None:

@@ -2,82 +2,26 @@
 
 import numpy as np
 import pytest
+from synthetic_scene import HEADER, write_scene
 
 from snakesfm.artifacts import (
-    CalibratedCameras,
     CameraCenters,
     CameraRotations,
-    Header,
-    ImageIndex,
-    LocalFeatures,
     Reconstruction,
     TrackTable,
     TriangulatedPoints,
-    TwoViewGeometries,
     ViewGraph,
 )
 from snakesfm.config.adjust_bundle import AdjustBundleOptions
 from snakesfm.config.build_tracks import BuildTracksOptions
 from snakesfm.config.triangulate_tracks import TriangulateTracksOptions
 from snakesfm.errors import SceneError
-from snakesfm.geometry.camera import cameras_to_columns
 from snakesfm.geometry.rotations import angle_of
 from snakesfm.stages import adjust_bundle, build_tracks, triangulate_tracks
 from snakesfm.stages.job import StageJob
 from snakesfm.synthetic.problems import make_problem, perturb_rotations
 
-HEADER = Header("test", 1, "scene")
 COUNT = 12
-
-
-def write_features(made, folder, blocks=2):
-    paths = []
-    for block in range(blocks):
-        ids = np.arange(COUNT)[block::blocks]
-        points = np.concatenate([made.keypoints[i] for i in ids])
-        count = len(points)
-        path = folder / f"features{block}.h5"
-        LocalFeatures(
-            image_ids=ids,
-            names=[f"{i}.jpg" for i in ids],
-            digests=[""] * len(ids),
-            sizes=np.tile([640, 480], (len(ids), 1)),
-            offsets=np.r_[0, np.cumsum([len(made.keypoints[i]) for i in ids])],
-            keypoints=points,
-            descriptors=np.zeros((count, 8), np.uint8),
-            scores=np.ones(count, np.float32),
-            scales=np.ones(count, np.float32),
-            angles=np.zeros(count, np.float32),
-            colors=np.full((count, 3), 7 + block, np.uint8),
-        ).write(path, HEADER)
-        paths.append(path)
-    return paths
-
-
-def write_geometries(made, folder):
-    """Two tiles; the first pair is rejected."""
-    paths = []
-    rejected = np.r_[3, np.zeros(len(made.pairs) - 1, int)]
-    for tile, rows in enumerate((np.arange(0, len(made.pairs), 2), np.arange(1, len(made.pairs), 2))):
-        parts = [made.matches[made.match_offsets[r] : made.match_offsets[r + 1]] for r in rows]
-        path = folder / f"tile{tile}.h5"
-        TwoViewGeometries(
-            pairs=made.pairs[rows],
-            digests=[""] * len(rows),
-            rotations=made.edge_rotations[rows],
-            translations=made.edge_translations[rows],
-            covariances=made.edge_covariances[rows],
-            kinds=np.zeros(len(rows), int),
-            rejections=rejected[rows],
-            match_counts=np.array([len(p) for p in parts]),
-            inlier_counts=np.array([len(p) for p in parts]),
-            inlier_ratios=np.ones(len(rows)),
-            triangulation_angles_deg=made.edge_angles_deg[rows],
-            offsets=np.r_[0, np.cumsum([len(p) for p in parts])],
-            inliers=np.concatenate(parts),
-        ).write(path, HEADER)
-        paths.append(path)
-    return paths
 
 
 @pytest.fixture
@@ -87,56 +31,21 @@ def made():
 
 @pytest.fixture
 def inputs(made, tmp_path):
-    models, sizes, params, sources = cameras_to_columns(made.cameras)
-    ImageIndex(
-        names=[f"{i}.jpg" for i in range(COUNT)],
-        sizes=np.tile(sizes, (COUNT, 1)),
-        sha256=[""] * COUNT,
-        blocks=np.arange(COUNT) % 2,
-        camera_ids=made.camera_ids,
-        orientations=np.ones(COUNT, int),
-        focal_exif_px=np.full(COUNT, np.nan),
-        gps=np.full((COUNT, 3), np.nan),
-        duplicate_of=np.full(COUNT, -1),
-        camera_models=models,
-        camera_sizes=sizes,
-        camera_params=params,
-        camera_sources=sources,
-        refused_names=[],
-        refused_reasons=[],
-    ).write(tmp_path / "index.h5", HEADER)
-    CalibratedCameras(models, sizes, params, sources, np.array([np.nan]), np.array([0])).write(
-        tmp_path / "cameras.h5", HEADER
-    )
-    edges = len(made.pairs)
-    ViewGraph(
-        pairs=made.pairs,
-        rotations=made.edge_rotations,
-        translations=made.edge_translations,
-        covariances=made.edge_covariances,
-        kinds=np.zeros(edges, int),
-        inlier_counts=made.edge_inlier_counts,
-        triangulation_angles_deg=made.edge_angles_deg,
-        labels=np.zeros(edges, int),
-        cycle_min_deg=np.zeros(edges),
-        cycle_median_deg=np.zeros(edges),
-        components=np.zeros(COUNT, int),
-    ).write(tmp_path / "graph.h5", HEADER)
+    """Averaged poses with noise, none of image 5."""
+    inputs = write_scene(made, tmp_path)
     rotations = perturb_rotations(made.rotations, 0.3, 1)
     rotations[5] = np.nan
-    CameraRotations(rotations, np.zeros(edges), np.zeros(edges, int)).write(
-        tmp_path / "rotations.h5", HEADER
+    edges = len(made.pairs)
+    components = np.where(np.arange(COUNT) == 5, -1, 0)
+    CameraRotations(rotations, np.zeros(edges), np.zeros(edges, int), components).write(
+        inputs["rotations"], HEADER
     )
     centers = made.centers + np.random.default_rng(0).normal(0, 0.01, (COUNT, 3))
     centers[5] = np.nan
     CameraCenters(centers, np.zeros(edges), np.ones(edges, bool), np.zeros(0, int), np.zeros(0)).write(
-        tmp_path / "centers.h5", HEADER
+        inputs["centers"], HEADER
     )
-    names = ("index", "cameras", "graph", "rotations", "centers", "tracks", "points")
-    return {name: tmp_path / f"{name}.h5" for name in names} | {
-        "features": write_features(made, tmp_path),
-        "geometries": write_geometries(made, tmp_path),
-    }
+    return inputs
 
 
 def run(stage, options, inputs, output, **settings):

@@ -62,7 +62,10 @@ def write_inputs(folder, truth, rotations, kinds=None, labels=None):
         components=np.zeros(count, np.int32),
     )
     averaged = CameraRotations(
-        rotations=rotations, residuals_deg=np.zeros(edges), labels=np.zeros(edges, np.int8)
+        rotations=rotations,
+        residuals_deg=np.zeros(edges),
+        labels=np.zeros(edges, np.int8),
+        components=np.where(np.isfinite(rotations[:, 0, 0]), 0, -1),
     )
     tracks = TrackTable(
         offsets=truth.track_offsets,

@@ -124,8 +124,7 @@ def test_three_stages_recover_the_rotations(scene, method, averager):
     labels = np.array(EDGE_LABELS)[filtered.labels]
     assert labels[wrong] == ("cycle_message" if method == "message_passing" else "cycle_min")
     apart = filtered.pairs[:, 0] >= GROUP
-    assert (labels[apart] == "component").all()
-    assert np.count_nonzero(labels == "kept") == len(labels) - 4
+    assert np.count_nonzero(labels == "kept") == len(labels) - 1
     assert 0.01 < np.median(filtered.cycle_median_deg) < 2.0
     known = np.isfinite(averaged.rotations[:, 0, 0])
     np.testing.assert_array_equal(known, np.arange(IMAGES) < GROUP)
@@ -133,7 +132,10 @@ def test_three_stages_recover_the_rotations(scene, method, averager):
     gauge = averaged.rotations[known].transpose(0, 2, 1) @ truth[known]
     errors = np.degrees(angle_of(gauge @ Rotation.from_matrix(gauge).mean().as_matrix().T))
     assert 0.02 < errors.mean() < 0.5
-    np.testing.assert_array_equal(averaged.labels, filtered.labels)
+    # three images apart are too few for rotations of their own
+    small = EDGE_LABELS.index("component")
+    np.testing.assert_array_equal(averaged.labels, np.where(apart, small, filtered.labels))
+    np.testing.assert_array_equal(averaged.components, np.where(known, 0, -1))
     assert 40 < averaged.residuals_deg[wrong] < 70
     np.testing.assert_array_equal(np.isnan(averaged.residuals_deg), apart)
 
@@ -143,10 +145,11 @@ def test_residuals_refuse_what_the_filter_left(scene):
         method="cycles", first_pass="none", second_pass="none", cluster_vote=False
     )
     _, filtered, averaged = run_all(scene, options, AverageRotationsOptions())
-    assert np.count_nonzero(filtered.labels) == 3
+    assert np.count_nonzero(filtered.labels) == 0
     wrong = (filtered.pairs == (0, 6)).all(axis=1)
     assert EDGE_LABELS[averaged.labels[wrong][0]] == "rotation_residual"
-    np.testing.assert_array_equal(averaged.labels[~wrong], filtered.labels[~wrong])
+    apart = filtered.pairs[:, 0] >= GROUP
+    assert (averaged.labels[~wrong & ~apart] == 0).all()
 
 
 def test_same_run_gives_the_same_bytes(scene):

@@ -1,0 +1,62 @@
+"""Models of several worlds: what of a scene belongs to which, and all of them together."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from snakesfm.bundle.model import BundleModel
+from snakesfm.geometry.camera import Camera
+
+Array = NDArray[Any]
+
+
+def restrict_to(model: BundleModel, images: Array) -> BundleModel:
+    """Poses and observations of some images (N,) bool, and the points that two of them observe."""
+    kept = images[model.image_ids]
+    point_of = np.repeat(np.arange(len(model.points)), np.diff(model.offsets))
+    counts = np.bincount(point_of[kept], minlength=len(model.points))
+    kept &= counts[point_of] >= 2
+    lengths = counts[counts >= 2]
+    return replace(
+        model,
+        rotations=np.where(images[:, None, None], model.rotations, np.nan),
+        translations=np.where(images[:, None], model.translations, np.nan),
+        points=model.points[counts >= 2],
+        offsets=np.r_[0, np.cumsum(lengths)].astype(np.int64),
+        image_ids=model.image_ids[kept],
+        keypoint_ids=model.keypoint_ids[kept],
+    )
+
+
+def registered_in(model: BundleModel) -> Array:
+    """Which images (N,) bool have a pose."""
+    return np.asarray(np.isfinite(model.rotations[:, 0, 0]) & np.isfinite(model.translations[:, 0]))
+
+
+def join_models(models: Sequence[BundleModel], cameras: tuple[Camera, ...]) -> tuple[BundleModel, Array]:
+    """All models in one, and the model of each image (N,) int32, -1 where it is in none.
+
+    No image is in two of them. ``cameras`` are the intrinsics of all.
+    """
+    first = models[0]
+    labels = np.full(len(first.camera_ids), -1, dtype=np.int32)
+    rotations, translations = first.rotations.copy(), first.translations.copy()
+    for number, model in enumerate(models):
+        mine = registered_in(model)
+        labels[mine] = number
+        rotations[mine], translations[mine] = model.rotations[mine], model.translations[mine]
+    lengths = np.concatenate([np.diff(model.offsets) for model in models])
+    joined = replace(
+        first,
+        cameras=cameras,
+        rotations=rotations,
+        translations=translations,
+        points=np.concatenate([model.points for model in models]),
+        offsets=np.r_[0, np.cumsum(lengths)].astype(np.int64),
+        image_ids=np.concatenate([model.image_ids for model in models]),
+        keypoint_ids=np.concatenate([model.keypoint_ids for model in models]),
+    )
+    return joined, labels

@@ -1,0 +1,144 @@
+"""A synthetic problem as the artifacts of a scene."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from snakesfm.artifacts import (
+    CalibratedCameras,
+    Header,
+    ImageIndex,
+    LocalFeatures,
+    TwoViewGeometries,
+    ViewGraph,
+)
+from snakesfm.geometry.camera import cameras_to_columns
+from snakesfm.view_graph.components import label_components
+
+HEADER = Header("test", 1, "scene")
+STAGES_AFTER = ("rotations", "centers", "tracks", "points", "reconstruction")
+
+
+def write_scene(made, folder):
+    """Write all up to the view graph; the paths of these and of what the stages after it write, by name."""
+    count, edges = made.image_count, len(made.pairs)
+    models, sizes, params, sources = cameras_to_columns(made.cameras)
+    ImageIndex(
+        names=[f"{i}.jpg" for i in range(count)],
+        sizes=np.tile(sizes[:1], (count, 1)),
+        sha256=[""] * count,
+        blocks=np.arange(count) % 2,
+        camera_ids=made.camera_ids,
+        orientations=np.ones(count, int),
+        focal_exif_px=np.full(count, np.nan),
+        gps=np.full((count, 3), np.nan),
+        duplicate_of=np.full(count, -1),
+        camera_models=models,
+        camera_sizes=sizes,
+        camera_params=params,
+        camera_sources=sources,
+        refused_names=[],
+        refused_reasons=[],
+    ).write(folder / "index.h5", HEADER)
+    CalibratedCameras(
+        models, sizes, params, sources, np.full(len(models), np.nan), np.zeros(len(models), int)
+    ).write(folder / "cameras.h5", HEADER)
+    ViewGraph(
+        pairs=made.pairs,
+        rotations=made.edge_rotations,
+        translations=made.edge_translations,
+        covariances=made.edge_covariances,
+        kinds=np.zeros(edges, int),
+        inlier_counts=made.edge_inlier_counts,
+        triangulation_angles_deg=made.edge_angles_deg,
+        labels=np.zeros(edges, int),
+        cycle_min_deg=np.zeros(edges),
+        cycle_median_deg=np.zeros(edges),
+        components=label_components(count, made.pairs),
+    ).write(folder / "graph.h5", HEADER)
+    names = ("index", "cameras", "graph", *STAGES_AFTER)
+    return {name: folder / f"{name}.h5" for name in names} | {
+        "features": write_features(made, folder),
+        "geometries": write_geometries(made, folder),
+    }
+
+
+def side_by_side(first, second):
+    """Two problems as one scene of two parts that share the camera and nothing else."""
+    images, points = first.image_count, len(first.points)
+    return replace(
+        first,
+        camera_ids=np.r_[first.camera_ids, second.camera_ids],
+        rotations=np.concatenate([first.rotations, second.rotations]),
+        translations=np.concatenate([first.translations, second.translations]),
+        centers=np.concatenate([first.centers, second.centers]),
+        points=np.concatenate([first.points, second.points]),
+        keypoints=first.keypoints + second.keypoints,
+        keypoint_points=first.keypoint_points
+        + tuple(np.where(rows < 0, rows, rows + points) for rows in second.keypoint_points),
+        track_offsets=np.r_[first.track_offsets, second.track_offsets[1:] + first.track_offsets[-1]],
+        track_image_ids=np.r_[first.track_image_ids, second.track_image_ids + images],
+        track_keypoint_ids=np.r_[first.track_keypoint_ids, second.track_keypoint_ids],
+        track_outliers=np.r_[first.track_outliers, second.track_outliers],
+        pairs=np.concatenate([first.pairs, second.pairs + images]),
+        edge_rotations=np.concatenate([first.edge_rotations, second.edge_rotations]),
+        edge_translations=np.concatenate([first.edge_translations, second.edge_translations]),
+        edge_covariances=np.concatenate([first.edge_covariances, second.edge_covariances]),
+        edge_inlier_counts=np.r_[first.edge_inlier_counts, second.edge_inlier_counts],
+        edge_angles_deg=np.r_[first.edge_angles_deg, second.edge_angles_deg],
+        edge_outliers=np.r_[first.edge_outliers, second.edge_outliers],
+        match_offsets=np.r_[first.match_offsets, second.match_offsets[1:] + first.match_offsets[-1]],
+        matches=np.concatenate([first.matches, second.matches]),
+        match_outliers=np.r_[first.match_outliers, second.match_outliers],
+    )
+
+
+def write_features(made, folder, blocks=2):
+    """Features in blocks; the red of an image says its block."""
+    paths = []
+    for block in range(blocks):
+        ids = np.arange(made.image_count)[block::blocks]
+        points = np.concatenate([made.keypoints[i] for i in ids])
+        count = len(points)
+        path = folder / f"features{block}.h5"
+        LocalFeatures(
+            image_ids=ids,
+            names=[f"{i}.jpg" for i in ids],
+            digests=[""] * len(ids),
+            sizes=np.tile([640, 480], (len(ids), 1)),
+            offsets=np.r_[0, np.cumsum([len(made.keypoints[i]) for i in ids])],
+            keypoints=points,
+            descriptors=np.zeros((count, 8), np.uint8),
+            scores=np.ones(count, np.float32),
+            scales=np.ones(count, np.float32),
+            angles=np.zeros(count, np.float32),
+            colors=np.full((count, 3), 7 + block, np.uint8),
+        ).write(path, HEADER)
+        paths.append(path)
+    return paths
+
+
+def write_geometries(made, folder):
+    """Two tiles; the first pair is rejected."""
+    paths = []
+    rejected = np.r_[3, np.zeros(len(made.pairs) - 1, int)]
+    for tile, rows in enumerate((np.arange(0, len(made.pairs), 2), np.arange(1, len(made.pairs), 2))):
+        parts = [made.matches[made.match_offsets[r] : made.match_offsets[r + 1]] for r in rows]
+        path = folder / f"tile{tile}.h5"
+        TwoViewGeometries(
+            pairs=made.pairs[rows],
+            digests=[""] * len(rows),
+            rotations=made.edge_rotations[rows],
+            translations=made.edge_translations[rows],
+            covariances=made.edge_covariances[rows],
+            kinds=np.zeros(len(rows), int),
+            rejections=rejected[rows],
+            match_counts=np.array([len(p) for p in parts]),
+            inlier_counts=np.array([len(p) for p in parts]),
+            inlier_ratios=np.ones(len(rows)),
+            triangulation_angles_deg=made.edge_angles_deg[rows],
+            offsets=np.r_[0, np.cumsum([len(p) for p in parts])],
+            inliers=np.concatenate(parts),
+        ).write(path, HEADER)
+        paths.append(path)
+    return paths

@@ -1,0 +1,161 @@
+"""A scene of parts that nothing ties together: a model of each, from the averagings to the export."""
+
+import json
+
+import numpy as np
+import pycolmap
+import pytest
+from synthetic_scene import side_by_side, write_scene
+
+from snakesfm.artifacts import CameraCenters, CameraRotations, Reconstruction
+from snakesfm.bundle.model import BundleModel
+from snakesfm.bundle.models import join_models, registered_in, restrict_to
+from snakesfm.config.adjust_bundle import AdjustBundleOptions
+from snakesfm.config.average_rotations import AverageRotationsOptions
+from snakesfm.config.average_translations import AverageTranslationsOptions
+from snakesfm.config.build_tracks import BuildTracksOptions
+from snakesfm.config.evaluate_model import EvaluateModelOptions
+from snakesfm.config.export_model import ExportModelOptions
+from snakesfm.config.triangulate_tracks import TriangulateTracksOptions
+from snakesfm.geometry.rotations import angle_of
+from snakesfm.stages import (
+    adjust_bundle,
+    average_rotations,
+    average_translations,
+    build_tracks,
+    evaluate_model,
+    export_model,
+    triangulate_tracks,
+)
+from snakesfm.stages.job import StageJob
+from snakesfm.synthetic.problems import make_problem
+
+SMALL, LARGE = 10, 14
+COUNT = SMALL + LARGE
+PART = np.arange(COUNT) >= SMALL
+
+
+@pytest.fixture(scope="module")
+def made():
+    small, large = (make_problem(n, 800, noise_px=0.3, seed=n) for n in (SMALL, LARGE))
+    return side_by_side(small, large)
+
+
+def run(stage, options, inputs, output, *more, **settings):
+    name = stage.__name__.split(".")[-1]
+    stage.run(StageJob(name, "scene", inputs, (output, *more), options, settings, 1))
+
+
+@pytest.fixture(scope="module")
+def scene(made, tmp_path_factory):
+    """The inputs by name, every stage run."""
+    folder = tmp_path_factory.mktemp("scene")
+    inputs = write_scene(made, folder)
+    settings = {"intrinsics": "fixed", "images": str(folder / "images")}
+    run(average_rotations, AverageRotationsOptions(), inputs, inputs["rotations"])
+    run(build_tracks, BuildTracksOptions(), inputs, inputs["tracks"])
+    run(average_translations, AverageTranslationsOptions(), inputs, inputs["centers"])
+    run(triangulate_tracks, TriangulateTracksOptions(), inputs, inputs["points"])
+    options = AdjustBundleOptions(refine_keypoints=False)
+    run(adjust_bundle, options, inputs, inputs["reconstruction"], **settings)
+    return inputs
+
+
+def rotation_errors_deg(rotations, truth):
+    relative, true = rotations @ rotations[0].T, truth @ truth[0].T
+    return np.degrees(angle_of(relative @ true.transpose(0, 2, 1)))[1:]
+
+
+def test_each_part_is_averaged_in_a_world_of_its_own(made, scene):
+    averaged = CameraRotations.read(scene["rotations"])
+    np.testing.assert_array_equal(averaged.components, np.where(PART, 0, 1))
+    centers = CameraCenters.read(scene["centers"]).centers
+    for part in (PART, ~PART):
+        assert rotation_errors_deg(averaged.rotations[part], made.rotations[part]).max() < 2.0
+        found, true = (c[part] - np.median(c[part], axis=0) for c in (centers, made.centers))
+        aligned = pycolmap.estimate_sim3d(found, true)
+        errors = np.linalg.norm([aligned * c for c in found] - true, axis=1)
+        assert errors.max() < 0.03 * np.ptp(true, axis=0).max()
+
+
+def test_parts_that_are_too_small_stay_out(scene, tmp_path):
+    options = AverageRotationsOptions(min_component_images=SMALL + 1)
+    run(average_rotations, options, scene, tmp_path / "rotations.h5")
+    averaged = CameraRotations.read(tmp_path / "rotations.h5")
+    np.testing.assert_array_equal(averaged.components, np.where(PART, 0, -1))
+    assert np.isnan(averaged.rotations[~PART]).all()
+
+
+def test_each_part_becomes_a_model_the_largest_first(made, scene):
+    model = Reconstruction.read(scene["reconstruction"])
+    assert model.model_count == 2
+    np.testing.assert_array_equal(model.models, np.where(PART, 0, 1))
+    for number, part in ((0, PART), (1, ~PART)):
+        one = model.select_model(number)
+        np.testing.assert_array_equal(np.isfinite(one.rotations[:, 0, 0]), part)
+        assert part[one.image_ids].all() and len(one.points) > 100
+        assert np.diff(one.offsets).min() >= 3
+        assert rotation_errors_deg(one.rotations[part], made.rotations[part]).max() < 0.5
+        assert 0.15 < np.average(one.errors_px, weights=np.diff(one.offsets)) < 0.6
+    assert "part 2, round 3" in model.round_names.tolist() and "round 3" in model.round_names.tolist()
+
+
+def test_models_are_exported_side_by_side_and_the_first_is_evaluated(made, scene, tmp_path):
+    settings = {"images": str(tmp_path), "reference": ""}
+    files = ("sparse/0/images.bin", "summary.json")
+    options = ExportModelOptions(link_images=False)
+    run(export_model, options, scene, *(tmp_path / file for file in files), **settings)
+    for number, part in ((0, PART), (1, ~PART)):
+        model = pycolmap.Reconstruction(str(tmp_path / "sparse" / str(number)))
+        assert {image.name for image in model.images.values()} == {
+            f"{row}.jpg" for row in np.flatnonzero(part)
+        }
+        assert 0.1 < model.compute_mean_reprojection_error() < 0.6
+    summary = json.loads((tmp_path / "summary.json").read_text("utf-8"))
+    assert (summary["registered_images"], summary["images_in_other_models"]) == (LARGE, [SMALL])
+    assert summary["not_registered"] == [] and f"{SMALL} images have no tie" in summary["warnings"][0]
+    run(evaluate_model, EvaluateModelOptions(), scene, tmp_path / "metrics.json", **settings)
+    metrics = json.loads((tmp_path / "metrics.json").read_text("utf-8"))
+    assert (metrics["registered_images"], metrics["images_in_other_models"]) == (LARGE, SMALL)
+    assert metrics["points"] == summary["points"]
+
+
+def test_models_that_are_gone_leave_no_folder(scene, tmp_path):
+    (tmp_path / "sparse" / "7").mkdir(parents=True)
+    files = ("sparse/0/images.bin", "summary.json")
+    options = ExportModelOptions(link_images=False)
+    run(export_model, options, scene, *(tmp_path / file for file in files), images=str(tmp_path))
+    assert sorted(path.name for path in (tmp_path / "sparse").iterdir()) == ["0", "1"]
+
+
+def whole_model(made):
+    return BundleModel(
+        made.cameras,
+        made.camera_ids,
+        made.rotations,
+        made.translations,
+        made.points,
+        made.track_offsets,
+        made.track_image_ids,
+        made.track_keypoint_ids,
+    )
+
+
+def test_parts_of_a_model_joined_again_are_the_model(made):
+    model = whole_model(made)
+    parts = [restrict_to(model, images) for images in (~PART, PART)]
+    assert [int(registered_in(part).sum()) for part in parts] == [SMALL, LARGE]
+    joined, labels = join_models(parts, made.cameras)
+    np.testing.assert_array_equal(labels, PART.astype(int))
+    for name in ("rotations", "translations", "points", "offsets", "image_ids", "keypoint_ids"):
+        np.testing.assert_array_equal(getattr(joined, name), getattr(model, name))
+
+
+def test_a_point_that_one_image_of_a_part_sees_is_none_of_it(made):
+    model = whole_model(made)
+    images = np.arange(COUNT) < 3
+    part = restrict_to(model, images)
+    assert images[part.image_ids].all() and np.diff(part.offsets).min() >= 2
+    kept = images[model.image_ids]
+    seen = np.add.reduceat(kept.astype(int), model.offsets[:-1])
+    assert len(part.points) == np.count_nonzero(seen >= 2) < np.count_nonzero(seen)
