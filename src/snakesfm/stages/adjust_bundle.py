@@ -72,7 +72,7 @@ def run(job: StageJob) -> None:
     records: list[RoundRecord] = []
     for component in range(int(averaged.components.max(initial=0)) + 1):
         part = restrict_to(replace(model, cameras=cameras), (averaged.components == component) & ~taken)
-        if component and registered_in(part).sum() < SMALLEST_FURTHER_MODEL:
+        if registered_in(part).sum() < (SMALLEST_FURTHER_MODEL if component else 2):
             continue
         prefix = f"part {component + 1}, " if component else ""
         result, observed, rounds = _adjust(job, index, part, graph, keypoints, taken, prefix)

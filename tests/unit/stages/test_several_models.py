@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pycolmap
 import pytest
-from synthetic_scene import side_by_side, write_scene
+from synthetic_scene import HEADER, side_by_side, write_scene
 
 from snakesfm.artifacts import CameraCenters, CameraRotations, Reconstruction
 from snakesfm.bundle.model import BundleModel
@@ -98,6 +98,18 @@ def test_each_part_becomes_a_model_the_largest_first(made, scene):
         assert rotation_errors_deg(one.rotations[part], made.rotations[part]).max() < 0.5
         assert 0.15 < np.average(one.errors_px, weights=np.diff(one.offsets)) < 0.6
     assert "part 2, round 3" in model.round_names.tolist() and "round 3" in model.round_names.tolist()
+
+
+def test_a_part_without_centres_is_no_model(scene, tmp_path):
+    centers = CameraCenters.read(scene["centers"])
+    columns = dict(vars(centers)) | {"centers": np.where(PART[:, None], np.nan, centers.centers)}
+    CameraCenters(**columns).write(tmp_path / "centers.h5", HEADER)
+    inputs = scene | {"centers": tmp_path / "centers.h5"}
+    options = AdjustBundleOptions(refine_keypoints=False)
+    run(adjust_bundle, options, inputs, tmp_path / "model.h5", intrinsics="fixed", images="")
+    model = Reconstruction.read(tmp_path / "model.h5")
+    np.testing.assert_array_equal(model.models, np.where(PART, -1, 0))
+    assert len(model.points) > 100
 
 
 def test_models_are_exported_side_by_side_and_the_first_is_evaluated(made, scene, tmp_path):
