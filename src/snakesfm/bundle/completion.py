@@ -8,7 +8,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from snakesfm.bundle.model import observations_of
+from snakesfm.bundle.reading import observations_of
 
 Array = NDArray[Any]
 

@@ -8,7 +8,7 @@ import numpy as np
 import pycolmap
 
 from snakesfm.bundle.interface import SolverSettings
-from snakesfm.bundle.model import observations_of
+from snakesfm.bundle.reading import observations_of
 from snakesfm.errors import ConfigError
 from snakesfm.geometry.poses import to_rigid3d
 

@@ -13,7 +13,7 @@ from snakesfm.bundle.alignment import (
     align_observations,
     choose_templates,
 )
-from snakesfm.bundle.model import observations_of, observed_keypoints
+from snakesfm.bundle.reading import observations_of, observed_keypoints
 
 Array = NDArray[Any]
 

@@ -12,6 +12,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from snakesfm.bundle.reading import observations_of
 from snakesfm.geometry.camera import Camera
 from snakesfm.geometry.poses import to_rigid3d
 
@@ -114,36 +115,6 @@ def from_reconstruction(reconstruction: pycolmap.Reconstruction, model: BundleMo
         images[take].astype(np.int32),
         rows[take].astype(np.int32),
     )
-
-
-def observations_of(reconstruction: pycolmap.Reconstruction) -> tuple[Array, Array, Array, Array]:
-    """Points (T,3) and, per observation, the rows (L,) of its point, image and keypoint."""
-    points3d = reconstruction.points3D
-    ids = sorted(points3d)
-    positions = np.array([points3d[key].xyz for key in ids], dtype=np.float64).reshape(-1, 3)
-    lengths = np.array([points3d[key].track.length() for key in ids], dtype=np.int64)
-    # number by number: a list of all observations would take ten times the memory
-    numbers = (
-        number
-        for key in ids
-        for element in points3d[key].track.elements
-        for number in (element.image_id, element.point2D_idx)
-    )
-    flat = np.fromiter(numbers, np.int64, 2 * int(lengths.sum())).reshape(-1, 2)
-    return positions, np.repeat(np.arange(len(ids)), lengths), flat[:, 0] - 1, flat[:, 1]
-
-
-def observed_keypoints(reconstruction: pycolmap.Reconstruction, images: Array, rows: Array) -> Array:
-    """Pixels (L,2) of keypoints, as the reconstruction holds them now.
-
-    Parameters
-    ----------
-    images : (L,) image of each keypoint (row, not id).
-    rows : (L,) row of each keypoint in its image.
-    """
-    found = reconstruction.images
-    pairs = zip(images.tolist(), rows.tolist(), strict=True)
-    return np.array([found[image + 1].point2D(row).xy for image, row in pairs]).reshape(-1, 2)
 
 
 def reprojection_errors(model: BundleModel, keypoints: Array) -> Array:

@@ -10,7 +10,7 @@ import poselib
 import pycolmap
 from numpy.typing import NDArray
 
-from snakesfm.bundle.model import observations_of
+from snakesfm.bundle.reading import observations_of
 from snakesfm.geometry.poses import to_rigid3d
 
 Array = NDArray[Any]

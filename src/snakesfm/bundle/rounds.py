@@ -172,10 +172,10 @@ class _Mapper:
         gone wild is held until the pass ends: the next one starts from better poses and points.
         """
         settings = self.settings
-        solving = replace(
-            self.solving, constant_rotations=constant_rotations, loss_scale_px=self.loss_scale_px()
-        )
-        if not final:
+        solving = replace(self.solving, constant_rotations=constant_rotations)
+        if final:
+            solving = replace(solving, loss_scale_px=self.loss_scale_px())
+        else:
             solving = replace(
                 solving,
                 function_tolerance=solving.function_tolerance * EARLY_TOLERANCE,

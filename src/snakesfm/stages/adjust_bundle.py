@@ -18,11 +18,11 @@ from snakesfm.bundle.keypoint_refinement import most_share_a_camera
 from snakesfm.bundle.model import (
     BundleModel,
     from_reconstruction,
-    observed_keypoints,
     reprojection_errors,
     to_reconstruction,
 )
 from snakesfm.bundle.models import join_models, registered_in, restrict_to
+from snakesfm.bundle.reading import observed_keypoints
 from snakesfm.bundle.rounds import (
     ImageSource,
     RoundRecord,

@@ -11,7 +11,8 @@ from snakesfm.bundle.alignment import (
     choose_templates,
 )
 from snakesfm.bundle.keypoint_refinement import most_share_a_camera, refine_keypoints
-from snakesfm.bundle.model import BundleModel, observations_of, observed_keypoints, to_reconstruction
+from snakesfm.bundle.model import BundleModel, to_reconstruction
+from snakesfm.bundle.reading import observations_of, observed_keypoints
 from snakesfm.geometry.camera import Camera
 from snakesfm.geometry.rotations import exp_so3
 
