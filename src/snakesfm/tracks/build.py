@@ -66,11 +66,16 @@ def build_tracks(
     counts = np.diff(offsets)
     pair_of = np.repeat(np.arange(len(pairs)), counts)
     links = np.stack([base[pairs[pair_of, side]] + matches[:, side] for side in (0, 1)], axis=1)
-    _, kept = np.unique(links[:, 0] * np.int64(base[-1]) + links[:, 1], return_index=True)
+    # equal links are of one pair, so any of them will do
+    keys = links[:, 0] * base[-1] + links[:, 1]
+    kept = np.argsort(keys)
+    kept = kept[np.diff(keys[kept], prepend=-1) != 0]
     links, weights = links[kept], counts[pair_of[kept]]
 
-    nodes, flat = np.unique(links, return_inverse=True)
-    links = flat.reshape(-1, 2).astype(np.int64)
+    matched = np.zeros(base[-1], dtype=bool)
+    matched[links] = True
+    nodes = np.flatnonzero(matched)
+    links = (np.cumsum(matched) - 1)[links]
     images = (np.searchsorted(base, nodes, side="right") - 1).astype(np.int64)
     parts = _components(links[~unconfirmed_links(links, images)], len(nodes))
     labels = _components(links, len(nodes))
@@ -101,7 +106,8 @@ def _components(links: Array, count: int) -> Array:
 
 def _conflicting(labels: Array, images: Array) -> Array:
     """Nodes (K,) bool of components that hold two keypoints of one image."""
-    order = np.lexsort((images, labels))
+    # nodes ascend by image
+    order = np.argsort(labels, kind="stable")
     same = (np.diff(labels[order]) == 0) & (np.diff(images[order]) == 0)
     bad = np.zeros(int(labels.max(initial=-1)) + 1, dtype=bool)
     bad[labels[order][1:][same]] = True
@@ -110,7 +116,7 @@ def _conflicting(labels: Array, images: Array) -> Array:
 
 def _one_per_image(labels: Array, images: Array, degrees: Array) -> Array:
     """Nodes (K,) bool that stand for their place: the best linked of each track and image."""
-    order = np.lexsort((np.arange(len(labels)), -degrees, images, labels))
+    order = np.lexsort((-degrees, images, labels))
     fresh = np.r_[True, (np.diff(labels[order]) != 0) | (np.diff(images[order]) != 0)][: len(labels)]
     observed = np.zeros(len(labels), dtype=bool)
     observed[order[fresh]] = True
@@ -127,18 +133,18 @@ def _assemble(
     conflicts: int,
 ) -> Tracks:
     labels, parts, images, rows = labels[observed], parts[observed], images[observed], rows[observed]
-    _, first, inverse, lengths = np.unique(
-        labels, return_index=True, return_inverse=True, return_counts=True
-    )
+    lengths = np.bincount(labels)
     # nodes ascend by image and keypoint, so a track's first node is its first observation
-    rank = first[inverse]
-    keep = lengths[inverse] >= min_length
+    first = np.zeros(len(lengths), dtype=np.int64)
+    first[labels[::-1]] = np.arange(len(labels))[::-1]
+    rank = first[labels]
+    keep = lengths[labels] >= min_length
     order = np.nonzero(keep)[0]
     order = order[np.argsort(rank[order], kind="stable")]
     starts = np.r_[True, np.diff(rank[order]) != 0][: len(order)]
     offsets = np.r_[np.nonzero(starts)[0], len(order)].astype(np.int64)
-    keys = np.stack([rank[order], parts[order]], axis=1)
-    part_ids = np.unique(keys, axis=0, return_inverse=True)[1].ravel() if len(order) else order
+    keys = rank[order] * (parts.max(initial=0) + 1) + parts[order]
+    part_ids = np.unique(keys, return_inverse=True)[1]
     return Tracks(
         offsets,
         images[order].astype(np.int32),

@@ -7,6 +7,8 @@ from numpy.typing import NDArray
 
 Array = NDArray[Any]
 
+ROWS_AT_ONCE = 200_000
+
 
 def cycle_support(links: Array, count: int) -> Array:
     """How many 3-cycles of links confirm each link.
@@ -25,8 +27,16 @@ def cycle_support(links: Array, count: int) -> Array:
     ones = np.ones(len(links), dtype=np.int32)
     half = csr_matrix((ones, (links[:, 0], links[:, 1])), shape=(count, count))
     adjacency = half + half.T
-    paths = (adjacency @ adjacency).multiply(half).tocsr()
-    return np.asarray(paths[links[:, 0], links[:, 1]]).ravel().astype(np.int64)
+    order = np.argsort(links[:, 0], kind="stable")
+    bounds = np.searchsorted(links[order, 0], np.arange(0, count + ROWS_AT_ONCE, ROWS_AT_ONCE))
+    support = np.zeros(len(links), dtype=np.int64)
+    # the paths of all nodes at once would take more memory than all else together
+    for k, start in enumerate(range(0, count, ROWS_AT_ONCE)):
+        mine = order[bounds[k] : bounds[k + 1]]
+        rows = slice(start, start + ROWS_AT_ONCE)
+        paths = (adjacency[rows] @ adjacency).multiply(half[rows]).tocsr()
+        support[mine] = np.asarray(paths[links[mine, 0] - start, links[mine, 1]]).ravel()
+    return support
 
 
 def unconfirmed_links(links: Array, images: Array) -> Array:

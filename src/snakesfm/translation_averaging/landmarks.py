@@ -21,11 +21,12 @@ def cover_cameras(ray_images: Array, ray_tracks: Array, image_count: int, rays_p
     lack = [rays_per_camera] * image_count
     images = ray_images.tolist()
     chosen = np.zeros(len(tracks), dtype=bool)
-    for k in np.lexsort((tracks, -lengths)):
-        if lengths[k] < 2:
-            break
-        row = images[starts[k] : starts[k] + lengths[k]]
-        if any(lack[i] > 0 for i in row):
+    order = np.lexsort((tracks, -lengths))
+    order = order[lengths[order] >= 2]
+    ends = (starts + lengths)[order].tolist()
+    for k, start, end in zip(order.tolist(), starts[order].tolist(), ends, strict=True):
+        row = images[start:end]
+        if max(map(lack.__getitem__, row)) > 0:
             chosen[k] = True
             for i in row:
                 lack[i] -= 1
