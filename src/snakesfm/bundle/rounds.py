@@ -21,6 +21,7 @@ from snakesfm.bundle.interface import BundleAdjuster, SolverSettings
 from snakesfm.bundle.keypoint_refinement import refine_keypoints
 from snakesfm.bundle.principal_points import find_told_cameras
 from snakesfm.bundle.registration import register_left_out
+from snakesfm.bundle.selection import adjust_selection
 from snakesfm.geometry.camera import Camera
 
 Array = NDArray[Any]
@@ -54,6 +55,9 @@ class RoundSettings:
     min_angle_deg: float = 1.0
     min_track_length: int = 3
     min_observations: int = 10
+    select_above_images: int = 500
+    early_observations: int = 300
+    final_observations: int = 0
     seed: int = 0
 
 
@@ -186,13 +190,13 @@ class _Mapper:
                 and len(self.records) + 1 >= settings.distortion_from_round,
             )
         drop_short_tracks(self.reconstruction, settings.min_track_length)
-        costs = self.adjust(self.reconstruction, solving)
+        costs = self.solve(solving, final)
         wild = reset_wild_cameras(
             self.reconstruction, self.cameras, settings.max_focal_change, settings.max_distortion
         )
         if wild:
             held = solving.constant_cameras | {row + 1 for row in wild}
-            costs = self.adjust(self.reconstruction, replace(solving, constant_cameras=held))
+            costs = self.solve(replace(solving, constant_cameras=held), final)
         filter_observations(
             self.reconstruction, threshold_px, settings.min_angle_deg, settings.min_track_length
         )
@@ -211,6 +215,14 @@ class _Mapper:
         )
         self.records.append(record)
         self.report(record)
+
+    def solve(self, solving: SolverSettings, final: bool) -> tuple[float, float]:
+        """One pass of the solver, in large models on as many observations as the settings say."""
+        settings = self.settings
+        per_image = settings.final_observations if final else settings.early_observations
+        if not per_image or self.reconstruction.num_reg_images() <= settings.select_above_images:
+            return self.adjust(self.reconstruction, solving)
+        return adjust_selection(self.reconstruction, self.adjust, solving, per_image, settings.seed)
 
     def refine_principal_points(self) -> None:
         """One more round in which the principal points that the model tells are free."""

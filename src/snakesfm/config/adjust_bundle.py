@@ -99,6 +99,15 @@ class AdjustBundleOptions(StageOptions):
     min_observations: int = Field(default=10, ge=0)
     """Observations that an image must have to stay registered."""
 
+    select_above_images: int = Field(default=500, ge=0)
+    """Registered images above which passes of the solver may work on a selection of the points."""
+
+    early_observations: int = Field(default=300, ge=0)
+    """Then, observations per image that early rounds adjust, those of the longest tracks; 0 for all."""
+
+    final_observations: int = Field(default=0, ge=0)
+    """The same in the last round and later ones; 0 for all."""
+
     max_iterations: int = Field(default=100, ge=1)
     """Iterations of the solver per pass."""
 
