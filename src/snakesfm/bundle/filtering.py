@@ -1,5 +1,6 @@
 """What is taken out of the model between rounds: observations, points, images, and intrinsics gone wild."""
 
+import heapq
 from collections.abc import Sequence
 
 import cv2  # noqa: F401 - must be loaded before pycolmap, whose PNG library clashes otherwise
@@ -39,15 +40,27 @@ def drop_short_tracks(reconstruction: pycolmap.Reconstruction, min_length: int) 
 def deregister_weak_images(reconstruction: pycolmap.Reconstruction, min_observations: int) -> list[int]:
     """Take out images with fewer observations, the weakest first; the rows that were taken out."""
     taken: list[int] = []
-    while True:
-        counts = {i: reconstruction.image(i).num_points3D for i in reconstruction.reg_image_ids()}
-        if not counts:
-            return taken
-        weakest = min(counts, key=lambda i: (counts[i], i))
-        if counts[weakest] >= min_observations:
-            return taken
-        reconstruction.deregister_frame(reconstruction.image(weakest).frame_id)
-        taken.append(weakest - 1)
+    counts = {i: reconstruction.image(i).num_points3D for i in reconstruction.reg_image_ids()}
+    heap = [(count, image_id) for image_id, count in counts.items()]
+    heapq.heapify(heap)
+    while heap and heap[0][0] < min_observations:
+        count, image_id = heapq.heappop(heap)
+        if counts.get(image_id) != count:
+            continue
+        image = reconstruction.image(image_id)
+        sharing = {
+            element.image_id
+            for keypoint in image.get_observation_points2D()
+            for element in reconstruction.point3D(keypoint.point3D_id).track.elements
+        }
+        reconstruction.deregister_frame(image.frame_id)
+        taken.append(image_id - 1)
+        del counts[image_id]
+        # points that two images saw are gone
+        for other in sharing - {image_id}:
+            counts[other] = reconstruction.image(other).num_points3D
+            heapq.heappush(heap, (counts[other], other))
+    return taken
 
 
 def reset_wild_cameras(

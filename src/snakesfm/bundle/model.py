@@ -18,6 +18,8 @@ from snakesfm.geometry.poses import to_rigid3d
 
 Array = NDArray[Any]
 
+POINTS_AT_ONCE = 10_000
+
 
 @dataclass(frozen=True)
 class BundleModel:
@@ -70,12 +72,17 @@ def to_reconstruction(
             reconstruction.add_image_with_trivial_frame(image, pose)
         else:
             reconstruction.add_image_with_trivial_frame(image)
-    images, rows = (model.image_ids + 1).tolist(), model.keypoint_ids.tolist()
-    usable, offsets = posed[model.image_ids].tolist(), model.offsets.tolist()
-    for point, start, end in zip(model.points, offsets[:-1], offsets[1:], strict=True):
-        track = [pycolmap.TrackElement(images[k], rows[k]) for k in range(start, end) if usable[k]]
-        if len(track) >= 2:
-            reconstruction.add_point3D(point, pycolmap.Track(track))
+    usable = posed[model.image_ids]
+    for first in range(0, len(model.points), POINTS_AT_ONCE):
+        # numbers of Python take several times the memory of the arrays
+        bounds = model.offsets[first : first + POINTS_AT_ONCE + 1]
+        part = slice(int(bounds[0]), int(bounds[-1]))
+        images, rows = (model.image_ids[part] + 1).tolist(), model.keypoint_ids[part].tolist()
+        kept, offsets = usable[part].tolist(), (bounds - bounds[0]).tolist()
+        for point, start, end in zip(model.points[first:], offsets[:-1], offsets[1:], strict=False):
+            track = [pycolmap.TrackElement(images[k], rows[k]) for k in range(start, end) if kept[k]]
+            if len(track) >= 2:
+                reconstruction.add_point3D(point, pycolmap.Track(track))
     return reconstruction
 
 

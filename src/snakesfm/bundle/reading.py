@@ -5,7 +5,6 @@ per observation. Its binary files (COLMAP's documentation, "Output Format") hold
 and are written and read in a tenth of that.
 """
 
-import mmap
 import struct
 import tempfile
 from collections.abc import Iterator
@@ -23,6 +22,7 @@ Array = NDArray[Any]
 POINT = np.dtype(
     [("id", "<u8"), ("xyz", "<f8", 3), ("color", "u1", 3), ("error", "<f8"), ("length", "<u8")]
 )
+ELEMENT = np.dtype([("image", "<u4"), ("keypoint", "<u4")])
 KEYPOINT = np.dtype([("xy", "<f8", 2), ("point", "<u8")])
 COUNT = struct.Struct("<Q")
 IMAGE = struct.Struct("<I7dI")
@@ -31,18 +31,17 @@ IMAGE = struct.Struct("<I7dI")
 def observations_of(reconstruction: pycolmap.Reconstruction) -> tuple[Array, Array, Array, Array]:
     """Points (T,3) by ascending id and, per observation, the rows (L,) of its point, image and keypoint."""
     with _written(reconstruction) as folder:
-        content = np.fromfile(folder / "points3D.bin", np.uint8)
-    buffer, at = content.data, COUNT.size
-    starts = np.empty(COUNT.unpack_from(buffer)[0], dtype=np.int64)
-    for k in range(len(starts)):
-        starts[k] = at
-        at += POINT.itemsize + 8 * COUNT.unpack_from(buffer, at + POINT.itemsize - 8)[0]
-    heads = starts[:, None] + np.arange(POINT.itemsize)
-    points = content[heads].view(POINT).reshape(-1)
-    between = np.ones(len(content), dtype=bool)
-    between[: COUNT.size] = False
-    between[heads] = False
-    elements = content[between].view("<u4").reshape(-1, 2).astype(np.int64)
+        content = (folder / "points3D.bin").read_bytes()
+    (count,) = COUNT.unpack_from(content)
+    heads, tracks, at = [], [], COUNT.size
+    for _ in range(count):
+        track = at + POINT.itemsize
+        heads.append(content[at:track])
+        at = track + ELEMENT.itemsize * COUNT.unpack_from(content, track - COUNT.size)[0]
+        tracks.append(content[track:at])
+    points = np.frombuffer(b"".join(heads), POINT)
+    elements = np.frombuffer(b"".join(tracks), ELEMENT)
+    del content, heads, tracks
     order = np.argsort(points["id"])
     lengths = points["length"].astype(np.int64)
     ends = np.cumsum(lengths)
@@ -50,7 +49,8 @@ def observations_of(reconstruction: pycolmap.Reconstruction) -> tuple[Array, Arr
     shifts = (ends - lengths)[order] - (np.cumsum(sorted_lengths) - sorted_lengths)
     elements = elements[np.repeat(shifts, sorted_lengths) + np.arange(len(elements))]
     point_rows = np.repeat(np.arange(len(points)), sorted_lengths)
-    return points["xyz"][order], point_rows, elements[:, 0] - 1, elements[:, 1]
+    images, rows = elements["image"].astype(np.int64) - 1, elements["keypoint"].astype(np.int64)
+    return points["xyz"][order], point_rows, images, rows
 
 
 def observed_keypoints(reconstruction: pycolmap.Reconstruction, images: Array, rows: Array) -> Array:
@@ -65,20 +65,16 @@ def observed_keypoints(reconstruction: pycolmap.Reconstruction, images: Array, r
     order = np.argsort(images, kind="stable")
     bounds = np.searchsorted(images[order], np.arange(int(images.max(initial=-1)) + 2))
     with _written(reconstruction) as folder, (folder / "images.bin").open("rb") as file:
-        content = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
-        at = COUNT.size
-        for _ in range(COUNT.unpack_from(content)[0]):
-            image = IMAGE.unpack_from(content, at)[0] - 1
-            at = content.find(b"\0", at + IMAGE.size) + 1
-            (count,) = COUNT.unpack_from(content, at)
-            at += COUNT.size
+        for _ in range(COUNT.unpack(file.read(COUNT.size))[0]):
+            image = IMAGE.unpack(file.read(IMAGE.size))[0] - 1
+            # the name, which ends with a zero
+            while file.read(1) != b"\0":
+                pass
+            (count,) = COUNT.unpack(file.read(COUNT.size))
+            keypoints = np.frombuffer(file.read(count * KEYPOINT.itemsize), KEYPOINT)["xy"]
             if image + 1 < len(bounds):
                 mine = order[bounds[image] : bounds[image + 1]]
-                keypoints = np.frombuffer(content, KEYPOINT, count, at)["xy"]
                 pixels[mine] = keypoints[rows[mine]]
-                del keypoints
-            at += count * KEYPOINT.itemsize
-        content.close()
     return pixels
 
 

@@ -48,7 +48,16 @@ def register_left_out(
     if not left_out:
         return []
     observed = _ObservedKeypoints.of(reconstruction)
-    found = {image: _matched_points(graph, image, observed) for image in left_out}
+    if not len(observed.keys):
+        return []
+    matched: dict[int, list[int]] = {image: [] for image in left_out}
+    for pair in graph.image_pairs():
+        first, second = pycolmap.pair_id_to_image_pair(pair)
+        if first in matched:
+            matched[first].append(second)
+        if second in matched:
+            matched[second].append(first)
+    found = {image: _matched_points(graph, image, others, observed) for image, others in matched.items()}
     done = []
     for image_id in sorted(left_out, key=lambda image: (-len(found[image]), image)):
         if len(found[image_id]) < min_inliers:
@@ -64,13 +73,11 @@ class _ObservedKeypoints:
 
     Parameters
     ----------
-    images : ids of the images that observe any.
     keys : (L,) int64, ascending, image id times ``factor`` plus keypoint.
     factor : larger than any keypoint.
     points : (L,) int64, id of the point.
     """
 
-    images: list[int]
     keys: Array
     factor: int
     points: Array
@@ -82,7 +89,7 @@ class _ObservedKeypoints:
         factor = int(rows.max(initial=0)) + 1
         keys = (images + 1) * factor + rows
         order = np.argsort(keys)
-        return cls((np.unique(images) + 1).tolist(), keys[order], factor, ids[points[order]])
+        return cls(keys[order], factor, ids[points[order]])
 
     def look_up(self, image_id: int, rows: Array) -> tuple[Array, Array]:
         """Which keypoints (K,) of an image observe a point, (K,) bool, and the points of those that do."""
@@ -93,13 +100,11 @@ class _ObservedKeypoints:
 
 
 def _matched_points(
-    graph: pycolmap.CorrespondenceGraph, image_id: int, observed: _ObservedKeypoints
+    graph: pycolmap.CorrespondenceGraph, image_id: int, others: list[int], observed: _ObservedKeypoints
 ) -> Array:
     """Rows (keypoint, point id, votes): for each keypoint the point that most of its matches observe."""
     parts = [np.zeros((0, 2), dtype=np.int64)]
-    for other in observed.images:
-        if graph.num_matches_between_images(image_id, other) == 0:
-            continue
+    for other in others:
         matches = graph.extract_matches_between_images(image_id, other)
         mine, theirs = np.asarray(matches, dtype=np.int64).reshape(-1, 2).T
         there, points = observed.look_up(other, theirs)

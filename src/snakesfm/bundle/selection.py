@@ -1,6 +1,7 @@
 """Large models adjusted by a selection of their points; the other points follow with the cameras held."""
 
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import cv2  # noqa: F401 - must be loaded before pycolmap, whose PNG library clashes otherwise
@@ -121,7 +122,7 @@ def _part(
         images,
         keypoint_ids,
     )
-    keypoints = [pixels[by_image[start:end]] for start, end in zip(bounds[:-1], bounds[1:], strict=True)]
+    keypoints = [pixels[by_image[start:end]] for start, end in pairwise(bounds.tolist())]
     return to_reconstruction(model, keypoints, [str(row) for row in range(count)])
 
 
@@ -163,9 +164,7 @@ class _Views:
 
     def part(self, rows: slice) -> "_Views":
         """Some of the observations."""
-        return _Views(
-            self.images[rows], self.rays[rows], self.rotations, self.translations, self.focals_px
-        )
+        return _Views(self.images[rows], self.rays[rows], self.rotations, self.translations, self.focals_px)
 
 
 def follow_cameras(points: Array, owners: Array, views: _Views, scale_px: float) -> Array:
@@ -213,15 +212,15 @@ def _follow(points: Array, owners: Array, views: _Views, scale_px: float) -> Arr
     depths, places, offsets, losses = errors(points)
     for _ in range(STEPS):
         usable = (depths > 0) & np.isfinite(offsets).all(axis=1)
-        squares = np.where(usable, squared_focals * np.einsum("li,li->l", offsets, offsets), 0.0)
+        depths = np.where(usable, depths, 1.0)
+        places, offsets = (np.where(usable[:, None], values, 0.0) for values in (places, offsets))
+        squares = squared_focals * np.einsum("li,li->l", offsets, offsets)
         weights = np.where(usable, squared_focals / (1.0 + squares / scale_px**2), 0.0)
-        safe = np.where(usable, depths, 1.0)[:, None, None]
-        jacobian = (rotations[:, :2] - np.where(usable[:, None], places, 0.0)[..., None] * rotations[:, 2:]) / safe
+        jacobian = rotations[:, :2] - places[..., None] * rotations[:, 2:]
+        jacobian /= depths[:, None, None]
         weighted = jacobian * weights[:, None, None]
         normal = np.add.reduceat(np.einsum("lki,lkj->lij", weighted, jacobian), starts)
-        right = np.add.reduceat(
-            np.einsum("lki,lk->li", weighted, np.where(usable[:, None], offsets, 0.0)), starts
-        )
+        right = np.add.reduceat(np.einsum("lki,lk->li", weighted, offsets), starts)
         # a little of the trace keeps points of nearly parallel rays from running away
         damping = 1e-9 * np.trace(normal, axis1=1, axis2=2) + 1e-300
         step = np.linalg.solve(normal + damping[:, None, None] * np.eye(3), right[..., None])[..., 0]
