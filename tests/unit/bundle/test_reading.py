@@ -30,7 +30,8 @@ def reconstruction_with_gaps():
     for point in ids[3:20:4]:
         reconstruction.delete_point3D(point)
     longest = max(ids[20:], key=lambda k: reconstruction.point3D(k).track.length())
-    element = reconstruction.point3D(longest).track.elements[0]
+    first = reconstruction.point3D(longest).track.elements[0]
+    element = pycolmap.TrackElement(first.image_id, first.point2D_idx)
     reconstruction.delete_observation(element.image_id, element.point2D_idx)
     reconstruction.add_observation(longest, element)
     return reconstruction

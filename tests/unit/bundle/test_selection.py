@@ -75,7 +75,7 @@ def test_poses_and_all_points_come_out_as_by_adjusting_all(per_image):
 
 
 def test_points_that_were_not_chosen_are_as_if_solved_for_alone():
-    model, reconstruction = perturbed(noise_px=0.0)
+    _, reconstruction = perturbed(noise_px=0.0)
     adjust_selection(
         reconstruction, adjust_ceres, SolverSettings(loss_scale_px=1.0, function_tolerance=1e-12), 60, 0
     )
