@@ -6,11 +6,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from snakesfm.geometry.rotations import exp_so3, log_so3
+from snakesfm.geometry.sparse_systems import conjugate_gradients
 
 Array = NDArray[Any]
 
 DIRECT_DEGREE = 30
 """Mean degree up to which the sparse factor is small; denser graphs converge fast without one."""
+
+FACTORED_UNKNOWNS = 5000
+"""Unknowns up to which such a factor costs less than a second; its cost grows faster than the graph."""
 
 DENSE_SIZE = 1000
 """Unknowns up to which a system of a denser graph is factored as a full matrix."""
@@ -80,17 +84,21 @@ def solve_anisotropic(node_count: int, pairs: Array, information: Array, residua
         right[:, axis] = np.bincount(tails, weighted[:, axis], node_count)
         right[:, axis] -= np.bincount(heads, weighted[:, axis], node_count)
     increments = np.zeros(size)
-    solved = _solve_spd(hessian[3:, 3:], right.ravel()[3:, None], 2.0 * len(pairs) / node_count)
+    solved = _solve_spd(hessian[3:, 3:], right.ravel()[3:, None], 2.0 * len(pairs) / node_count, block=3)
     increments[3:] = solved[:, 0]
     return increments.reshape(node_count, 3)
 
 
-def _solve_spd(matrix: Any, right: Array, mean_degree: float) -> Array:
+def _solve_spd(matrix: Any, right: Array, mean_degree: float, block: int = 1) -> Array:
     """Solution (n,k) of a sparse symmetric positive definite system."""
     from scipy.linalg import cho_factor, cho_solve
     from scipy.sparse import diags_array
     from scipy.sparse.linalg import cg, splu
 
+    if mean_degree <= DIRECT_DEGREE and matrix.shape[0] > FACTORED_UNKNOWNS:
+        iterated = conjugate_gradients(matrix, right, block)
+        if iterated is not None:
+            return iterated
     if mean_degree <= DIRECT_DEGREE:
         factor = splu(
             matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from snakesfm.geometry.sparse_systems import conjugate_gradients
 from snakesfm.translation_averaging.landmarks import intersect, perpendicular, sum_by
 from snakesfm.translation_averaging.problem import PositioningProblem
 
@@ -15,7 +16,6 @@ DIRECT_CAMERAS = 300
 """Cameras up to which the reduced system is factored; the factor of a larger one grows faster than it."""
 
 CG_TOLERANCE = 1e-4
-CG_ITERATIONS = 1500
 
 
 @dataclass(frozen=True)
@@ -213,29 +213,20 @@ def _step(
 def solve_blocks(matrix: Any, right: Array, direct_up_to: int = DIRECT_CAMERAS) -> Array:
     """Solution (n,3) of a sparse symmetric positive definite system of 3x3 blocks.
 
-    By a sparse factor, or for more than ``direct_up_to`` blocks by conjugate gradients with the inverse
-    diagonal blocks as preconditioner, whose memory and time per iteration are those of the matrix. Where
-    these do not converge, by the factor after all.
+    By a sparse factor, or for more than ``direct_up_to`` blocks by conjugate gradients. Where these do not
+    converge, by the factor after all.
 
     Parameters
     ----------
     matrix : (3n,3n) sparse.
     right : (n,3).
     """
-    from scipy.sparse import bsr_matrix
-    from scipy.sparse.linalg import cg, splu
+    from scipy.sparse.linalg import splu
 
     if len(right) > direct_up_to:
-        blocks = matrix.tobsr((3, 3))
-        block_row = np.repeat(np.arange(len(right)), np.diff(blocks.indptr))
-        inverse = np.linalg.inv(blocks.data[blocks.indices == block_row])
-        places = np.arange(len(right) + 1)
-        preconditioner = bsr_matrix((inverse, places[:-1], places), shape=matrix.shape)
-        solution, failed = cg(
-            blocks, right.ravel(), rtol=CG_TOLERANCE, maxiter=CG_ITERATIONS, M=preconditioner
-        )
-        if not failed:
-            return np.asarray(solution.reshape(-1, 3))
+        solution = conjugate_gradients(matrix, right.reshape(-1, 1), 3, CG_TOLERANCE)
+        if solution is not None:
+            return solution.reshape(-1, 3)
     factor = splu(
         matrix, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True}, diag_pivot_thresh=0.0
     )

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from snakesfm.geometry.sparse_systems import conjugate_gradients
 from snakesfm.translation_averaging.landmarks import sum_by
 from snakesfm.translation_averaging.problem import PositioningProblem
 
@@ -17,6 +18,8 @@ Array = NDArray[Any]
 FIRST_SCALE = 16.0
 IRLS_ROUNDS = 12
 IRLS_TOLERANCE = 5e-3
+FACTORED_UNKNOWNS = 5000
+"""Unknowns up to which a Laplacian is factored; the factor of a larger one grows faster than it."""
 
 
 def shared_rays(problem: PositioningProblem) -> tuple[Array, Array, Array]:
@@ -159,7 +162,6 @@ def _log_baselines(
     """
     from scipy.sparse import coo_matrix, csr_matrix, diags
     from scipy.sparse.csgraph import connected_components
-    from scipy.sparse.linalg import splu
 
     result = np.full(edge_count, np.nan)
     seen = np.bincount(rows, minlength=row_count)
@@ -189,7 +191,7 @@ def _log_baselines(
         mean_value = np.bincount(row, weights=w * values) / per_row
         right = np.bincount(column, weights=w * (mean_value[row] - values))
         matrix = (laplacian + diags(1e-9 * laplacian.diagonal())).tocsc()
-        unknown = splu(matrix, permc_spec="MMD_AT_PLUS_A").solve(right)
+        unknown = _solve(matrix, right[:, None])[:, 0]
         if np.abs(unknown - before).max() < IRLS_TOLERANCE:
             break
         total = values + unknown[column]
@@ -206,7 +208,6 @@ def _link(
     """Centres (N,3) that differ by the edges' vectors, robustly; NaN off the largest connected part."""
     from scipy.sparse import coo_matrix, diags
     from scipy.sparse.csgraph import connected_components
-    from scipy.sparse.linalg import splu
 
     count = problem.image_count
     centers = np.full((count, 3), np.nan)
@@ -231,9 +232,19 @@ def _link(
         right = np.zeros((len(names), 3))
         np.add.at(right, ends[:, 1], vectors * w[:, None])
         np.add.at(right, ends[:, 0], -vectors * w[:, None])
-        place = splu(matrix, permc_spec="MMD_AT_PLUS_A").solve(right)
+        place = _solve(matrix, right)
         gap = place[ends[:, 1]] - place[ends[:, 0]] - vectors
         relative = np.linalg.norm(gap, axis=1) / baselines[taken]
         robust = 1.0 / np.maximum(relative, 0.01)
     centers[names] = place - np.median(place, axis=0)
     return centers
+
+
+def _solve(matrix: Any, right: Array) -> Array:
+    """Solution (n,k) of a Laplacian's system: factored where small or where iterations do not converge."""
+    from scipy.sparse.linalg import splu
+
+    solution = conjugate_gradients(matrix, right) if len(right) > FACTORED_UNKNOWNS else None
+    if solution is None:
+        solution = splu(matrix, permc_spec="MMD_AT_PLUS_A").solve(right)
+    return np.asarray(solution)
