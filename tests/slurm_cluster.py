@@ -153,11 +153,15 @@ class Cluster:
         munged += [f"--log-file={self.folder / 'munged.log'}", f"--seed-file={self.folder / 'munge.seed'}"]
         self._spawn("munged", munged)
         wait_for((self.folder / "munge.socket").exists, "munged")
-        self._spawn("slurmctld", ["slurmctld", "-D", "-f", str(self.configuration)])
-        wait_for(lambda: "UP" in self.call("scontrol", "ping"), "slurmctld")
+        self.start_controller()
         for name in self.names:
             self.start_node(name)
         self.wait_for_nodes("idle")
+
+    def start_controller(self) -> None:
+        """Start slurmctld, which goes on with what it had saved."""
+        self._spawn("slurmctld", ["slurmctld", "-D", "-f", str(self.configuration)])
+        wait_for(lambda: "UP" in self.call("scontrol", "ping"), "slurmctld")
 
     def start_node(self, name: str) -> None:
         """Start one slurmd."""

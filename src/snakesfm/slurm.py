@@ -1,11 +1,41 @@
 """The SLURM jobs of an earlier run: they live on when the run that submitted them was killed."""
 
 import subprocess
+import sys
 import time
+from typing import Any
 
 from snakesfm.errors import ConfigError
 
 LONGEST_WAIT_S = 300
+
+
+def steady(executor: Any) -> None:
+    """Have Snakemake's SLURM plugin (2.8) ask for its jobs at a steady pace, and go on while SLURM is down.
+
+    By itself it lets 10 s more pass after each answer in which no job had ended, so that a job of one minute
+    is noticed half a minute late. And it asks before each query how long SLURM remembers jobs; where
+    slurmctld does not answer, it takes ``sacct`` for all attempts of that query, and without accounting it
+    has then lost its jobs.
+
+    Parameters
+    ----------
+    executor : the plugin's, with jobs or without; its queries are as far apart as Snakemake's option
+        ``seconds-between-status-checks`` says, at most.
+    """
+    kind = type(executor)
+    longest = executor.workflow.remote_execution_settings.seconds_between_status_checks
+
+    def seconds(self: Any) -> float:
+        chosen: float = kind.next_seconds_between_status_checks.fget(self)
+        return min(chosen, longest)
+
+    pace = property(seconds, kind.next_seconds_between_status_checks.fset)
+    executor.__class__ = type(kind.__name__, (kind,), {"next_seconds_between_status_checks": pace})
+    plugin: Any = sys.modules[kind.__module__]
+    age = plugin.get_min_job_age()
+    if age is not None:
+        plugin.get_min_job_age = lambda: age
 
 
 def list_jobs(run: str) -> list[str]:

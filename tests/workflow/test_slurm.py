@@ -7,6 +7,7 @@ import shutil
 import signal
 import tempfile
 import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -15,7 +16,8 @@ from slurm_cluster import Cluster, missing_programs, wait_for
 from workflow_runner import Workflow, copy_run, model_bytes
 
 # polls as often as a test wants; everything else is the profile's
-QUICK = ("--slurm-init-seconds-before-status-checks", "2", "--max-status-checks-per-second", "2")
+QUICK = ("--seconds-between-status-checks", "1", "--max-status-checks-per-second", "2")
+OUTAGE_S = 15
 
 pytestmark = [
     pytest.mark.workflow,
@@ -195,6 +197,25 @@ def test_a_controller_that_is_ended_leaves_nothing_that_hinders_the_next(
     assert cluster.job(job)["JobState"] == "CANCELLED"
     assert model_bytes(output) == model_bytes(finished[0])
     assert not list(output.rglob("*.tmp"))
+
+
+def test_a_run_goes_on_when_slurm_is_back(
+    finished, small_scene: Path, cluster: Cluster, on_slurm: Workflow
+) -> None:
+    copy_run(finished[0], on_slurm.folder)
+    output = on_slurm.folder / "out" / "square"
+    (output / "render_report" / "index.html").unlink()
+    shutil.rmtree(output / "logs" / "render_report")
+    run = on_slurm.start(*QUICK, "--slurm-status-attempts", "60", *config_of(small_scene))
+    wait_for_process(output / "logs" / "render_report" / "job.log")
+    cluster.kill("slurmctld")
+    time.sleep(OUTAGE_S)
+    assert run.poll() is None
+    cluster.start_controller()
+    text, _ = run.communicate(timeout=120)
+    assert run.returncode == 0, text
+    assert (output / "render_report" / "index.html").is_file()
+    assert model_bytes(output) == model_bytes(finished[0])
 
 
 def test_jobs_that_cannot_be_ended_are_named_with_what_to_type(

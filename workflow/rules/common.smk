@@ -8,7 +8,7 @@ import sys
 from snakemake.exceptions import WorkflowError
 from snakemake.settings.types import DeploymentMethod
 
-from snakesfm import resources
+from snakesfm import resources, slurm
 from snakesfm.errors import SnakesfmError
 from snakesfm.plan import Plan, tile_names
 from snakesfm.run import Run
@@ -165,10 +165,13 @@ def all_hloc_files():
 
 def start_run():
     """Lock the output folder for this run, and say what is about to be done."""
-    # the SLURM executor names all jobs of a run alike
     executor = getattr(workflow.scheduler, "_executor", None)
+    # the SLURM executor names all jobs of a run alike
+    slurm_run = getattr(executor, "run_uuid", "")
+    if slurm_run:
+        slurm.steady(executor)
     try:
-        RUN.start(getattr(executor, "run_uuid", ""))
+        RUN.start(slurm_run)
     except SnakesfmError as error:
         raise WorkflowError(str(error)) from None
 
