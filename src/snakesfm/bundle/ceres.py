@@ -6,6 +6,9 @@ import pycolmap
 from snakesfm.bundle.interface import SolverSettings
 
 INNER_TOLERANCE = 0.1
+FACTORED_IMAGES = 5000
+"""Images up to which the reduced camera system is factored; beyond, memory could run short where many images
+see the same."""
 LOSSES = {
     "huber": pycolmap.LossFunctionType.HUBER,
     "cauchy": pycolmap.LossFunctionType.CAUCHY,
@@ -41,6 +44,7 @@ def _options(settings: SolverSettings) -> pycolmap.BundleAdjustmentOptions:
     options.constant_rig_from_world_rotation = settings.constant_rotations
     ceres = options.ceres
     ceres.use_gpu = False
+    ceres.max_num_images_direct_sparse_cpu_solver = FACTORED_IMAGES
     ceres.loss_function_type = LOSSES[settings.loss]
     ceres.loss_function_scale = settings.loss_scale_px
     solver = ceres.solver_options
