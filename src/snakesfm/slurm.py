@@ -13,8 +13,8 @@ LONGEST_WAIT_S = 300
 def steady(executor: Any) -> None:
     """Have Snakemake's SLURM plugin (2.8) ask for its jobs at a steady pace, and go on while SLURM is down.
 
-    By itself it lets 10 s more pass after each answer in which no job had ended, so that a job of one minute
-    is noticed half a minute late. And it asks before each query how long SLURM remembers jobs; where
+    By itself it lets 10 s more pass after each answer in which no job had ended, so that a job of one
+    minute is noticed half a minute late. And it asks before each query how long SLURM remembers jobs; where
     slurmctld does not answer, it takes ``sacct`` for all attempts of that query, and without accounting it
     has then lost its jobs.
 

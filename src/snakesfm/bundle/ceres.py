@@ -7,8 +7,8 @@ from snakesfm.bundle.interface import SolverSettings
 
 INNER_TOLERANCE = 0.1
 FACTORED_IMAGES = 5000
-"""Images up to which the reduced camera system is factored; beyond, memory could run short where many images
-see the same."""
+"""Images up to which the reduced camera system is factored; a larger one may fill up where most images see
+the same."""
 LOSSES = {
     "huber": pycolmap.LossFunctionType.HUBER,
     "cauchy": pycolmap.LossFunctionType.CAUCHY,
