@@ -28,7 +28,7 @@ def steady(executor: Any) -> None:
 
     def seconds(self: Any) -> float:
         chosen: float = kind.next_seconds_between_status_checks.fget(self)
-        return min(chosen, longest)
+        return float(min(chosen, longest))
 
     pace = property(seconds, kind.next_seconds_between_status_checks.fset)
     executor.__class__ = type(kind.__name__, (kind,), {"next_seconds_between_status_checks": pace})
