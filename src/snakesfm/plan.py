@@ -13,10 +13,11 @@ from typing import Any
 
 from snakesfm.config.base import StageOptions
 from snakesfm.config.configuration import STAGES, SceneInputs, list_scenes, load_configuration
+from snakesfm.config.match_pairs import MatchPairsOptions
 from snakesfm.config.select_pairs import SelectPairsOptions
 from snakesfm.digests import options_digest
 from snakesfm.errors import ConfigError
-from snakesfm.front_ends import FRONT_ENDS, check_methods, fetch_command, needed_weights
+from snakesfm.front_ends import DETECTOR_FREE, FRONT_ENDS, check_methods, fetch_command, needed_weights
 from snakesfm.ingest.discover import count_images, fingerprint_images
 from snakesfm.resources import Load, job_load
 
@@ -86,9 +87,11 @@ class ScenePlan:
                 f"select_pairs.method is 'listed', but scene '{self.name}' has no list: "
                 "give it with pairs=FILE."
             )
-        if self.method("extract_features") == "virtual" and not self.inputs.reference:
+        methods = (self.method("extract_features"), self.method("match_pairs"))
+        oracle = next((name for name in methods if name in ("virtual", "virtual_places")), "")
+        if oracle and not self.inputs.reference:
             raise ConfigError(
-                f"The front-end 'virtual' takes the points of a reference model, but scene '{self.name}' "
+                f"The front-end '{oracle}' takes the points of a reference model, but scene '{self.name}' "
                 "has none: give reference=PATH."
             )
         if self.method("extract_features") == "imported" and not self.inputs.imported:
@@ -147,7 +150,9 @@ class ScenePlan:
             return self.select_pairs
         options: StageOptions = getattr(self.configuration, stage)
         if stage in ("extract_features", "match_pairs"):
-            return options.model_copy(update={"method": self.method(stage)})
+            options = options.model_copy(update={"method": self.method(stage)})
+        if isinstance(options, MatchPairsOptions):
+            return options.resolve()
         if stage == "adjust_bundle" and self.method("extract_features") == "virtual":
             # what the images show is less exact than the projections of the model's points
             return options.model_copy(update={"refine_keypoints": False})
@@ -169,7 +174,7 @@ class ScenePlan:
     def source_settings(self, stage: str) -> dict[str, Any]:
         """What a stage is told of where known keypoints or matches are; nothing where it finds them."""
         method = self.method(stage)
-        if method == "virtual" and stage == "extract_features":
+        if method == "virtual_places" or (method == "virtual" and stage == "extract_features"):
             reference = str(Path(self.inputs.reference).expanduser())
             return {"reference": reference, "source_content": _file_digest(reference)}
         if method == "imported":
@@ -201,10 +206,30 @@ class ScenePlan:
         names = tile_names(self.blocks) if parts == "tiles" else map(str, range(self.blocks))
         return [str(self.folder / stage / f"{name}.h5") for name in names]
 
+    @property
+    def detector_free(self) -> bool:
+        """Whether pairs are matched without keypoints, which are then merged from the matches."""
+        return self.method("match_pairs") in DETECTOR_FREE
+
+    @property
+    def features_stage(self) -> str:
+        """The stage whose keypoints the stages after matching read."""
+        return "merge_keypoints" if self.detector_free else "extract_features"
+
+    @property
+    def matches_stage(self) -> str:
+        """The stage whose matches the stages after matching read."""
+        return "index_matches" if self.detector_free else "match_pairs"
+
     def tile_features(self, tile: str) -> list[str]:
-        """The one or two feature blocks that a tile reads."""
+        """The one or two blocks of keypoints that belong to a tile's matches."""
         blocks = sorted({int(block) for block in tile.split("-")})
-        return [str(self.folder / "extract_features" / f"{block}.h5") for block in blocks]
+        return [str(self.folder / self.features_stage / f"{block}.h5") for block in blocks]
+
+    def block_tiles(self, block: str) -> list[str]:
+        """The tiles of coordinates with a block's images."""
+        tiles = [name for name in tile_names(self.blocks) if block in name.split("-")]
+        return [str(self.folder / "match_pairs" / f"{name}.h5") for name in tiles]
 
     def global_descriptors(self) -> list[str]:
         """The global descriptors of all blocks where pairs are retrieved, else nothing."""
@@ -246,8 +271,10 @@ class ScenePlan:
     def all_files(self) -> list[str]:
         """What a run makes of the scene; Snakemake re-makes a lost file only if it is asked for by name."""
         files = [str(self.folder / name) for name in SCENE_ARTIFACTS]
-        files += self.files("extract_features", "blocks")
-        for stage in ("select_pairs", "match_pairs", "estimate_two_view"):
+        files += self.files(self.features_stage, "blocks")
+        for stage in dict.fromkeys(
+            ("select_pairs", "match_pairs", self.matches_stage, "estimate_two_view")
+        ):
             files += self.files(stage, "tiles")
         if self.select_pairs.needs_descriptors:
             files.append(str(self.folder / "learn_vocabulary" / "vocabulary.h5"))
@@ -276,7 +303,12 @@ class ScenePlan:
             return settings | self.weight_settings(stage, main_process) | self.source_settings(stage)
         if stage == "match_pairs":
             learned = self.weight_settings(stage, main_process)
-            return {"detector": self.method("extract_features")} | learned | self.source_settings(stage)
+            known = learned | self.source_settings(stage)
+            if self.detector_free:
+                return {"images": str(self.images)} | known
+            return {"detector": self.method("extract_features")} | known
+        if stage == "merge_keypoints":
+            return {"images": str(self.images), "block": int(wildcards["block"])}
         if stage == "select_pairs":
             return {
                 "blocks": self.blocks,

@@ -61,9 +61,52 @@ def files_of(stage, parts):
     return list_files
 
 
+def keypoint_files(wildcards):
+    """The keypoints of all blocks that the stages after matching read."""
+    scene = PLAN.scenes[wildcards.scene]
+    return scene.files(scene.features_stage, "blocks")
+
+
+def match_files(wildcards):
+    """The matches of all tiles that the stages after matching read."""
+    scene = PLAN.scenes[wildcards.scene]
+    return scene.files(scene.matches_stage, "tiles")
+
+
+def coordinate_files(wildcards):
+    """What was matched without keypoints in all tiles, else nothing."""
+    scene = PLAN.scenes[wildcards.scene]
+    return scene.files("match_pairs", "tiles") if scene.detector_free else []
+
+
 def tile_features(wildcards):
-    """The one or two feature blocks that a tile reads."""
+    """The one or two blocks of keypoints that belong to a tile's matches."""
     return PLAN.scenes[wildcards.scene].tile_features(wildcards.tile)
+
+
+def matched_features(wildcards):
+    """The one or two blocks of keypoints that a tile matches, nothing where it matches images."""
+    scene = PLAN.scenes[wildcards.scene]
+    return [] if scene.detector_free else scene.tile_features(wildcards.tile)
+
+
+def matched_images(wildcards):
+    """The index where a tile matches images instead of keypoints, else nothing."""
+    scene = PLAN.scenes[wildcards.scene]
+    return (
+        [str(scene.folder / "index_images" / "index.h5")] if scene.detector_free else []
+    )
+
+
+def tile_matches(wildcards):
+    """The matches of a tile that the stages after matching read."""
+    scene = PLAN.scenes[wildcards.scene]
+    return str(scene.folder / scene.matches_stage / f"{wildcards.tile}.h5")
+
+
+def block_tiles(wildcards):
+    """The tiles with a block's images."""
+    return PLAN.scenes[wildcards.scene].block_tiles(wildcards.block)
 
 
 def global_descriptors(wildcards):

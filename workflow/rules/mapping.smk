@@ -64,7 +64,8 @@ rule average_rotations:
 rule build_tracks:
     input:
         index=artifact("index_images", "index.h5"),
-        features=files_of("extract_features", "blocks"),
+        features=keypoint_files,
+        coordinates=coordinate_files,
         geometries=files_of("estimate_two_view", "tiles"),
         graph=artifact("filter_view_graph", "graph.h5"),
         rotations=artifact("average_rotations", "rotations.h5"),
@@ -134,7 +135,7 @@ rule adjust_bundle:
     input:
         index=artifact("index_images", "index.h5"),
         cameras=artifact("calibrate_cameras", "cameras.h5"),
-        features=files_of("extract_features", "blocks"),
+        features=keypoint_files,
         geometries=files_of("estimate_two_view", "tiles"),
         graph=artifact("filter_view_graph", "graph.h5"),
         rotations=artifact("average_rotations", "rotations.h5"),

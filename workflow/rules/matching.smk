@@ -4,7 +4,8 @@
 rule match_pairs:
     input:
         pairs=artifact("select_pairs", "{tile}.h5"),
-        features=tile_features,
+        features=matched_features,
+        index=matched_images,
     output:
         artifact("match_pairs", "{tile}.h5"),
     log:
@@ -22,11 +23,51 @@ rule match_pairs:
         job_command("match_pairs")
 
 
+rule merge_keypoints:
+    input:
+        index=artifact("index_images", "index.h5"),
+        matches=block_tiles,
+    output:
+        artifact("merge_keypoints", "{block}.h5"),
+    log:
+        log_file("merge_keypoints", "{block}"),
+    benchmark:
+        benchmark_file("merge_keypoints", "{block}")
+    resources:
+        mem_mb=memory_mb("merge_keypoints"),
+        runtime=runtime_min("merge_keypoints"),
+    params:
+        job=job_params("merge_keypoints"),
+        files=job_files(),
+    shell:
+        job_command("merge_keypoints")
+
+
+rule index_matches:
+    input:
+        matches=artifact("match_pairs", "{tile}.h5"),
+        features=tile_features,
+    output:
+        artifact("index_matches", "{tile}.h5"),
+    log:
+        log_file("index_matches", "{tile}"),
+    benchmark:
+        benchmark_file("index_matches", "{tile}")
+    resources:
+        mem_mb=memory_mb("index_matches"),
+        runtime=runtime_min("index_matches"),
+    params:
+        job=job_params("index_matches"),
+        files=job_files(),
+    shell:
+        job_command("index_matches")
+
+
 rule calibrate_cameras:
     input:
         index=artifact("index_images", "index.h5"),
-        features=files_of("extract_features", "blocks"),
-        matches=files_of("match_pairs", "tiles"),
+        features=keypoint_files,
+        matches=match_files,
     output:
         artifact("calibrate_cameras", "cameras.h5"),
     log:
@@ -50,7 +91,7 @@ rule estimate_two_view:
         index=artifact("index_images", "index.h5"),
         cameras=artifact("calibrate_cameras", "cameras.h5"),
         features=tile_features,
-        matches=artifact("match_pairs", "{tile}.h5"),
+        matches=tile_matches,
     output:
         artifact("estimate_two_view", "{tile}.h5"),
     log:

@@ -10,7 +10,7 @@ from snakesfm.artifacts.mapping import (
     TrackTable,
     TriangulatedPoints,
 )
-from snakesfm.artifacts.pairs import ImagePairs, PairMatches, TwoViewGeometries, ViewGraph
+from snakesfm.artifacts.pairs import ImagePairs, PairCoordinates, PairMatches, TwoViewGeometries, ViewGraph
 
 ARTIFACTS: tuple[type[Artifact], ...] = (
     ImageIndex,
@@ -19,6 +19,7 @@ ARTIFACTS: tuple[type[Artifact], ...] = (
     GlobalDescriptors,
     ImagePairs,
     PairMatches,
+    PairCoordinates,
     CalibratedCameras,
     TwoViewGeometries,
     ViewGraph,
@@ -40,6 +41,7 @@ __all__ = [
     "ImageIndex",
     "ImagePairs",
     "LocalFeatures",
+    "PairCoordinates",
     "PairMatches",
     "Reconstruction",
     "TrackTable",

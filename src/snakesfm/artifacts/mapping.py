@@ -26,7 +26,7 @@ class TrackTable(Artifact):
     """Tracks: sets of keypoints that show one point, sorted by image within a track."""
 
     kind: ClassVar[str] = "tracks"
-    format_version: ClassVar[int] = 2
+    format_version: ClassVar[int] = 3
 
     offsets: Array = column("(T+1)", "int64", "rows offsets[k]:offsets[k+1] belong to track k")
     image_ids: Array = column("(L)", "int32", "row of the image in the index")
@@ -34,6 +34,10 @@ class TrackTable(Artifact):
     part_ids: Array = column("(L)", "int32", "part of a track that hangs together by confirmed matches")
     keypoints: Array = column("(L,2)", "float32", "x, y in original pixels")
     colors: Array = column("(L,3)", "uint8", "RGB of the image at the keypoint")
+    lengths_unmerged: Array = column(
+        "(U)", "int64", "detector-free: joined inlier matches as found, entry k: in k images; else empty"
+    )
+    lengths_merged: Array = column("(V)", "int64", "the same matches in merged keypoints, before splitting")
 
 
 @dataclass(frozen=True)

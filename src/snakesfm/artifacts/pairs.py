@@ -52,6 +52,19 @@ class PairMatches(Artifact):
 
 
 @dataclass(frozen=True)
+class PairCoordinates(Artifact):
+    """Places that match in the pairs of one tile, as a detector-free matcher finds them: no keypoints yet."""
+
+    kind: ClassVar[str] = "pair_coordinates"
+
+    pairs: Array = column("(P,2)", "int32", "rows (i, j) of the index, i < j, sorted")
+    digests: Array = column("(P)", "str", "digest of both images, options and stage version")
+    offsets: Array = column("(P+1)", "int64", "rows offsets[k]:offsets[k+1] belong to pair k")
+    coordinates: Array = column("(M,4)", "float32", "x, y in image i and x, y in image j, original pixels")
+    scores: Array = column("(M)", "float32", "match confidence, larger is better")
+
+
+@dataclass(frozen=True)
 class TwoViewGeometries(Artifact):
     """Relative pose, its covariance and the inlier matches of the pairs of one tile (or scene)."""
 

@@ -10,7 +10,7 @@ from snakesfm.config.base import StageOptions
 class BuildTracksOptions(StageOptions):
     """How matches are joined to tracks."""
 
-    stage_version: ClassVar[int] = 3
+    stage_version: ClassVar[int] = 4
 
     min_length: int = Field(default=3, ge=2)
     """Images that a track must be seen in; 2 where only two images have a rotation."""

@@ -20,6 +20,8 @@ STAGES: tuple[str, ...] = (
     "describe_images",
     "select_pairs",
     "match_pairs",
+    "merge_keypoints",
+    "index_matches",
     "calibrate_cameras",
     "estimate_two_view",
     "build_view_graph",
@@ -74,7 +76,10 @@ FrontEndName = Literal[
     "xfeat+lighterglue",
     "superpoint+lightglue",
     "superpoint+superglue",
+    "loftr",
+    "efficientloftr",
     "virtual",
+    "virtual_places",
     "imported",
 ]
 

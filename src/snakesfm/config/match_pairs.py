@@ -1,19 +1,29 @@
 """Options of match_pairs."""
 
-from typing import ClassVar, Literal
+from typing import Annotated, ClassVar, Literal, Self
 
 from pydantic import Field
 
 from snakesfm.config.base import StageOptions
+from snakesfm.front_ends import DETECTOR_FREE
 
 
 class MatchPairsOptions(StageOptions):
     """How the descriptors of two images are matched."""
 
-    stage_version: ClassVar[int] = 3
+    stage_version: ClassVar[int] = 4
 
-    method: Literal["mutual_ratio", "lightglue", "superglue", "virtual", "imported"] = "mutual_ratio"
-    """Mutual nearest neighbours with the ratio test, a network, an oracle, or hloc's file."""
+    method: Literal[
+        "mutual_ratio",
+        "lightglue",
+        "superglue",
+        "virtual",
+        "imported",
+        "loftr",
+        "efficientloftr",
+        "virtual_places",
+    ] = "mutual_ratio"
+    """Nearest neighbours, a network, an oracle, hloc's file, or a matcher without keypoints."""
 
     max_ratio: float = Field(0.8, gt=0.0, le=1.0)
     """Largest ratio of the distances to the nearest and second nearest descriptor (1: no test)."""
@@ -33,5 +43,20 @@ class MatchPairsOptions(StageOptions):
     min_likeness: float = Field(1.5, ge=0.0)
     """Least resemblance of these keypoints in a pair that is matched; higher leaves more pairs out."""
 
-    min_score: float = Field(0.1, ge=0.0, le=1.0)
-    """Least confidence of a match that a network makes."""
+    min_score: Annotated[float, Field(ge=0.0, le=1.0)] | Literal["auto"] = "auto"
+    """Least confidence of a match that a network makes; 'auto' is 0.1, and 0.2 without keypoints."""
+
+    longer_side_px: int = Field(840, ge=64, le=20_000)
+    """Longer side to which larger images are scaled down by a matcher without keypoints."""
+
+    spread_px: float = Field(2.0, ge=0.0, le=100.0)
+    """How far from its point the oracle 'virtual_places' puts a place, along x and y."""
+
+    noise_px: float = Field(0.3, ge=0.0, le=100.0)
+    """Standard deviation of the second place of each match of the oracle 'virtual_places'."""
+
+    def resolve(self) -> Self:
+        """The options with 'auto' replaced by what it means for the method."""
+        if self.min_score != "auto":
+            return self
+        return self.model_copy(update={"min_score": 0.2 if self.method in DETECTOR_FREE else 0.1})

@@ -98,6 +98,16 @@ WEIGHT_FILES: dict[str, WeightFile] = {
         NON_COMMERCIAL,
         url=f"{MAGIC_LEAP}/superglue_outdoor/resolve/main/model.safetensors",
     ),
+    "loftr": WeightFile(
+        "loftr_outdoor.ckpt",
+        "Apache-2.0",
+        url="https://huggingface.co/kornia/loftr/resolve/main/loftr_outdoor.ckpt",
+    ),
+    "efficientloftr": WeightFile(
+        "efficientloftr.safetensors",
+        "Apache-2.0",
+        url="https://huggingface.co/zju-community/efficientloftr/resolve/main/model.safetensors",
+    ),
 }
 
 

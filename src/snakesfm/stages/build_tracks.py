@@ -1,19 +1,25 @@
 """Stage build_tracks: inlier matches of the kept edges to tracks."""
 
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from snakesfm.artifacts.gather import gather_image_columns, gather_inlier_matches
 from snakesfm.artifacts.images import ImageIndex
 from snakesfm.artifacts.mapping import CameraRotations, TrackTable
-from snakesfm.artifacts.pairs import ViewGraph
+from snakesfm.artifacts.pairs import PairCoordinates, ViewGraph
 from snakesfm.errors import SceneError
 from snakesfm.stages.job import StageJob
 from snakesfm.tracks.build import build_tracks
+from snakesfm.tracks.merged import compare_track_lengths, describe_lengths
 
 if TYPE_CHECKING:
     from snakesfm.config.build_tracks import BuildTracksOptions
+
+Array = NDArray[Any]
 
 
 def run(job: StageJob) -> None:
@@ -51,6 +57,15 @@ def run(job: StageJob) -> None:
         f"{count} tracks of {lengths.mean():.2f} images on average from {len(matches)} matches; "
         f"{tracks.conflicts} components saw an image twice"
     )
+    nothing = np.zeros(0, np.int64)
+    unmerged, merged = nothing, nothing
+    if job.inputs.get("coordinates"):
+        found = _read_coordinates(job.paths("coordinates"), pairs)
+        unmerged, merged = compare_track_lengths(
+            keypoints, pairs, offsets, matches, lambda i, j: found[i, j]
+        )
+        print(f"joined as they were found: {describe_lengths(unmerged)}")
+        print(f"in merged keypoints: {describe_lengths(merged)}, before any is split or left out")
     base = np.r_[0, np.cumsum([len(k) for k in keypoints])]
     rows = base[tracks.image_ids] + tracks.keypoint_ids
     TrackTable(
@@ -60,4 +75,18 @@ def run(job: StageJob) -> None:
         part_ids=tracks.part_ids,
         keypoints=np.concatenate(keypoints)[rows],
         colors=np.concatenate(colors)[rows],
+        lengths_unmerged=unmerged,
+        lengths_merged=merged,
     ).write(job.output, job.header)
+
+
+def _read_coordinates(paths: Sequence[Path], pairs: Array) -> dict[tuple[int, int], Array]:
+    """Coordinates (N,4) that were found without keypoints in each of the wanted pairs."""
+    wanted = {(int(i), int(j)) for i, j in pairs}
+    found = {}
+    for path in paths:
+        tile = PairCoordinates.read(path)
+        for row, (i, j) in enumerate(tile.pairs.tolist()):
+            if (i, j) in wanted:
+                found[i, j] = tile.coordinates[tile.offsets[row] : tile.offsets[row + 1]]
+    return found

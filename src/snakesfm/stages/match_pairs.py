@@ -1,7 +1,8 @@
-"""Match the keypoints of the pairs of one tile."""
+"""Match the pairs of one tile: their keypoints, or without keypoints the images themselves."""
 
 import functools
 import hashlib
+import math
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
@@ -13,8 +14,18 @@ from numpy.typing import NDArray
 
 from snakesfm.artifacts.features import LocalFeatures
 from snakesfm.artifacts.hloc import MATCHES, open_hloc, read_hloc_matches
-from snakesfm.artifacts.pairs import ImagePairs, PairMatches
+from snakesfm.artifacts.images import ImageIndex
+from snakesfm.artifacts.pairs import ImagePairs, PairCoordinates, PairMatches
+from snakesfm.errors import ImageError
 from snakesfm.features.keypoints import KeypointSet
+from snakesfm.front_ends import DETECTOR_FREE
+from snakesfm.ingest.read import read_image
+from snakesfm.matching.detector_free import (
+    DetectorFreeMatcher,
+    Picture,
+    create_detector_free,
+    no_coordinates,
+)
 from snakesfm.matching.matcher import Matcher, create_matcher
 from snakesfm.matching.nearest import no_matches
 from snakesfm.stages.job import StageJob
@@ -33,33 +44,38 @@ HELD_IMAGES = 32
 
 
 def run(job: StageJob) -> None:
-    """Match pair after pair, taking over pairs whose images and options are unchanged; write PairMatches.
+    """Match pair after pair, taking over pairs whose images and options are unchanged.
 
-    The features of ``HELD_IMAGES`` images are held at a time, whatever the size of the blocks.
+    Writes PairMatches, or PairCoordinates where there are no keypoints. The features (or the pictures) of
+    ``HELD_IMAGES`` images are held at a time, whatever the size of the blocks.
     """
     options: MatchPairsOptions = job.options
     pairs = ImagePairs.read(job.path("pairs")).pairs
-    matcher = _create_matcher(job, options)
+    free = options.method in DETECTOR_FREE
+    kind: type[PairMatches | PairCoordinates] = PairCoordinates if free else PairMatches
+    matcher: Any = _create_detector_free(job, options) if free else _create_matcher(job, options)
     beside = job.weights_digest() + str(job.settings.get("source_content", ""))
+    if options.method == "virtual_places":
+        beside += f" {job.seed}"
     with ExitStack() as stack:
-        features = FeatureFiles(job.paths("features"), stack)
+        source = ImageFiles(job) if free else FeatureFiles(job.paths("features"), stack)
         digests = [
-            _digest(features.digests[i], features.digests[j], options, beside) for i, j in pairs.tolist()
+            _digest(source.digests[i], source.digests[j], options, beside) for i, j in pairs.tolist()
         ]
-        former = job.take_over(digests, _read_former)
+        former = job.take_over(digests, functools.partial(_read_former, kind))
         results = {row: former[digest] for row, digest in enumerate(digests) if digest in former}
         reused = len(results)
         progress = job.progress(len(pairs) - reused, "pairs")
-        read_second = functools.lru_cache(HELD_IMAGES)(lambda j: matcher.prepare_second(features.read(j)))
+        read_second = functools.lru_cache(HELD_IMAGES)(lambda j: matcher.prepare_second(source.read(j)))
         held, first = -1, None
         for row in _order(pairs, np.array([row for row in range(len(pairs)) if row not in results], int)):
             i, j = pairs[row].tolist()
             if i != held:
-                held, first = i, matcher.prepare(features.read(i))
+                held, first = i, matcher.prepare(source.read(i))
             results[row] = matcher.match(first, read_second(j))
             progress.step()
     matches = [results[row] for row in range(len(pairs))]
-    _collect(pairs, digests, matches).write(job.output, job.header)
+    _collect(kind, pairs, digests, matches).write(job.output, job.header)
     counts = [len(rows) for rows, _ in matches]
     print(
         f"{len(pairs)} pairs ({reused} taken over), {sum(counts)} matches, "
@@ -82,8 +98,27 @@ def _create_matcher(job: StageJob, options: "MatchPairsOptions") -> Matcher:
     return create_matcher(
         options.method,
         detector=detector,
-        min_score=options.min_score,
+        min_score=float(options.min_score),
         state=job.read_weights(f"{detector}_{options.method}"),
+    )
+
+
+def _create_detector_free(job: StageJob, options: "MatchPairsOptions") -> DetectorFreeMatcher:
+    if options.method == "virtual_places":
+        from snakesfm.evaluation.colmap_model import read_model
+
+        return create_detector_free(
+            options.method,
+            model=read_model(Path(job.settings["reference"])),
+            spread_px=options.spread_px,
+            noise_px=options.noise_px,
+            seed=job.seed,
+        )
+    return create_detector_free(
+        options.method,
+        min_score=float(options.min_score),
+        longer_side_px=options.longer_side_px,
+        state=job.read_weights(options.method),
     )
 
 
@@ -148,32 +183,71 @@ class FeatureFiles:
         return replace(points, image_size=size, image_name=name)
 
 
+class ImageFiles:
+    """The images of a scene, read one by one; one that cannot be decoded is black.
+
+    Parameters
+    ----------
+    job : with the index, the image folder and the size that is wanted.
+    """
+
+    def __init__(self, job: StageJob) -> None:
+        index = ImageIndex.read(job.paths("index")[0])
+        self.digests = [str(digest) for digest in index.sha256]
+        self._names = [str(name) for name in index.names]
+        self._sizes = [(width, height) for width, height in index.sizes.tolist()]
+        self._folder = Path(job.settings["images"])
+        self._side_px = int(job.options.longer_side_px)
+
+    def read(self, image: int) -> Picture:
+        """One image of the index, not smaller than the matcher wants it."""
+        name, size = self._names[image], self._sizes[image]
+        shorter = math.ceil(self._side_px * min(size) / max(size))
+        try:
+            pixels = read_image(self._folder / name, shorter)
+        except ImageError as error:
+            print(f"warning: {error}")
+            black = np.zeros((size[1], size[0], 3), np.uint8)
+            return Picture(name, size, black[..., 0], black)
+        # the last column and row may go beyond the original image
+        seen = (size[0] / pixels.reduction, size[1] / pixels.reduction)
+        width, height = (max(1, int(side)) for side in seen)
+        shown = (width * pixels.reduction, height * pixels.reduction)
+        return Picture(name, shown, pixels.gray[:height, :width], pixels.rgb[:height, :width])
+
+
 def _digest(first: str, second: str, options: "MatchPairsOptions", beside: str) -> str:
     text = "\0".join((first, second, options.canonical_json(), str(options.stage_version), beside))
     return hashlib.sha256(text.encode()).hexdigest()
 
 
-def _read_former(path: Path, wanted: set[str]) -> Mapping[str, Matches]:
+def _read_former(
+    kind: type[PairMatches | PairCoordinates], path: Path, wanted: set[str]
+) -> Mapping[str, Matches]:
     """What an earlier file holds of the pairs that are unchanged, by digest."""
-    former = PairMatches.read_former(path)
+    former = kind.read_former(path)
     if former is None:
         return {}
+    found = former.coordinates if isinstance(former, PairCoordinates) else former.matches
     parts = [slice(*former.offsets[row : row + 2]) for row in range(len(former.pairs))]
     return {
-        str(digest): (former.matches[part], former.scores[part])
+        str(digest): (found[part], former.scores[part])
         for digest, part in zip(former.digests, parts, strict=True)
         if digest in wanted
     }
 
 
-def _collect(pairs: Array, digests: list[str], results: list[Matches]) -> PairMatches:
+def _collect(
+    kind: type[PairMatches | PairCoordinates], pairs: Array, digests: list[str], results: list[Matches]
+) -> PairMatches | PairCoordinates:
     # an empty pair in front keeps shapes and dtypes where the tile has no pair
-    matches = [np.zeros((0, 2), np.int32), *(matches for matches, _ in results)]
-    scores = [np.zeros(0, np.float32), *(scores for _, scores in results)]
-    return PairMatches(
+    free = kind is PairCoordinates
+    nothing = no_coordinates() if free else no_matches()
+    matches, scores = ([nothing[part], *(result[part] for result in results)] for part in (0, 1))
+    return kind(
         pairs=pairs,
         digests=np.array(digests, dtype=object),
         offsets=np.cumsum([len(part) for part in matches]),
-        matches=np.concatenate(matches),
+        **{"coordinates" if free else "matches": np.concatenate(matches)},
         scores=np.concatenate(scores),
     )

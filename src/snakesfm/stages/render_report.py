@@ -35,6 +35,9 @@ from snakesfm.reporting.registration import (
 )
 from snakesfm.reporting.tables import bundle_rows, image_rows, label_counts, metric_tables, stage_times
 from snakesfm.stages.job import StageJob
+from snakesfm.tracks.merged import describe_lengths
+
+TRACK_COLUMNS = ("offsets", "image_ids", "lengths_unmerged", "lengths_merged")
 
 
 @dataclass(frozen=True)
@@ -56,7 +59,7 @@ def run(job: StageJob) -> None:
     graph = ViewGraph.read(job.path("graph"))
     rotations = CameraRotations.read(job.path("rotations"))
     pairs = _read_pairs(job.paths("geometries"))
-    tracks = _read_columns(TrackTable, job.path("tracks"), ("offsets", "image_ids"))
+    tracks = _read_columns(TrackTable, job.path("tracks"), TRACK_COLUMNS)
     points = _read_columns(TriangulatedPoints, job.path("points"), ("offsets", "image_ids"))
     metrics = json.loads(job.path("metrics").read_text("utf-8"))
     summary = json.loads(job.path("summary").read_text("utf-8")) if "summary" in job.inputs else {}
@@ -194,6 +197,11 @@ def _stage_rows(
         "adjust_bundle": f"{int(counts.registered.sum()):,} images, {len(model.points):,} points, "
         f"{len(model.image_ids):,} observations",
     }
+    if len(tracks["lengths_unmerged"]):
+        results["merge_keypoints"] = (
+            f"inlier matches joined as they were found: {describe_lengths(tracks['lengths_unmerged'])}; "
+            f"in merged keypoints: {describe_lengths(tracks['lengths_merged'])}"
+        )
     stages = [stage for stage in seconds if stage not in results]
     rows = [[stage, text] for stage, text in results.items()] + [[stage, ""] for stage in stages]
     return [[*row, *seconds.get(row[0], (None, None))] for row in rows] if seconds else rows

@@ -1,0 +1,3 @@
+from snakesfm.job import run_job
+
+run_job("merge_keypoints")

@@ -1,0 +1,80 @@
+"""The interface of what matches two images without keypoints."""
+
+import importlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[Any]
+
+
+@dataclass(frozen=True)
+class Picture:
+    """One image as a detector-free matcher gets it.
+
+    Parameters
+    ----------
+    name : POSIX path relative to the image folder.
+    size : width and height of the original image in pixels.
+    gray, rgb : (H,W) and (H,W,3) uint8, the image, maybe smaller than the original.
+    """
+
+    name: str
+    size: tuple[int, int]
+    gray: Array
+    rgb: Array
+
+
+class DetectorFreeMatcher(Protocol):
+    """Finds the same places in two images; a new one joins by an entry in ``DETECTOR_FREE_MATCHERS``.
+
+    What is found depends on the two images and the options alone, not on the pairs before.
+    """
+
+    def prepare(self, first: Picture) -> Any:
+        """Do once what all pairs of the image ``first`` need; the result goes into :meth:`match`."""
+
+    def prepare_second(self, second: Picture) -> Any:
+        """The same for the image ``second``; what it holds is not much more than the image."""
+
+    def match(self, first: Any, second: Any) -> tuple[Array, Array]:
+        """Match two images that are prepared.
+
+        Returns
+        -------
+        coordinates : (M,4) float32, x and y in the first and in the second image, in pixels of the original
+            images, the first pixel's centre at (0.5, 0.5).
+        scores : (M,) float32 in 0 .. 1, larger is better.
+        """
+
+
+def no_coordinates() -> tuple[Array, Array]:
+    """What two images that share nothing give."""
+    return np.zeros((0, 4), np.float32), np.zeros(0, np.float32)
+
+
+def _lazy(module: str, name: str) -> Callable[..., DetectorFreeMatcher]:
+    """A matcher whose libraries load when one is made."""
+
+    def make(**options: Any) -> DetectorFreeMatcher:
+        made: DetectorFreeMatcher = getattr(importlib.import_module(f"snakesfm.matching.{module}"), name)(
+            **options
+        )
+        return made
+
+    return make
+
+
+DETECTOR_FREE_MATCHERS: dict[str, Callable[..., DetectorFreeMatcher]] = {
+    "loftr": _lazy("loftr", "LoftrMatcher"),
+    "efficientloftr": _lazy("loftr", "EfficientLoftrMatcher"),
+    "virtual_places": _lazy("virtual_places", "VirtualPlaces"),
+}
+
+
+def create_detector_free(method: str, **options: Any) -> DetectorFreeMatcher:
+    """The matcher of a name in ``DETECTOR_FREE_MATCHERS``, with its own options."""
+    return DETECTOR_FREE_MATCHERS[method](**options)

@@ -1,0 +1,94 @@
+"""Merge the places that were matched in the images of one block into keypoints."""
+
+import hashlib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from snakesfm.artifacts.features import LocalFeatures
+from snakesfm.artifacts.images import ImageIndex
+from snakesfm.artifacts.pairs import PairCoordinates
+from snakesfm.errors import ImageError
+from snakesfm.features.extraction import sample_colors
+from snakesfm.ingest.read import read_image
+from snakesfm.matching.merging import merge_coordinates
+from snakesfm.stages.job import StageJob
+
+if TYPE_CHECKING:
+    from snakesfm.config.merge_keypoints import MergeKeypointsOptions
+
+Array = NDArray[Any]
+
+# colours need no more pixels than this
+COLOR_SIDE_PX = 760
+
+
+def run(job: StageJob) -> None:
+    """Write the LocalFeatures of the block's images, without descriptors.
+
+    An image's keypoints depend on all pairs that it is in, and neither on their order nor on the blocks.
+    """
+    options: MergeKeypointsOptions = job.options
+    index = ImageIndex.read(job.path("index"))
+    rows = np.flatnonzero(index.blocks == int(job.settings["block"]))
+    found = _gather(job.paths("matches"), set(rows.tolist()))
+    folder = Path(job.settings["images"])
+    progress = job.progress(len(rows), "images")
+    # an empty set in front keeps shapes and dtypes where the block has no image
+    keypoints, scores = [np.zeros((0, 2), np.float32)], [np.zeros(0, np.float32)]
+    colors = [np.zeros((0, 3), np.uint8)]
+    for row in rows.tolist():
+        merged, sure = merge_coordinates(*found[row], options.radius_px)
+        keypoints.append(merged)
+        scores.append(sure)
+        colors.append(_read_colors(folder / str(index.names[row]), merged))
+        progress.step()
+    count = sum(map(len, keypoints))
+    LocalFeatures(
+        image_ids=rows,
+        names=index.names[rows],
+        sizes=index.sizes[rows],
+        digests=np.array([hashlib.sha256(part.tobytes()).hexdigest() for part in keypoints[1:]], object),
+        offsets=np.cumsum([len(part) for part in keypoints]),
+        keypoints=np.concatenate(keypoints),
+        descriptors=np.zeros((count, 0), np.uint8),
+        scores=np.concatenate(scores),
+        scales=np.ones(count, np.float32),
+        angles=np.zeros(count, np.float32),
+        colors=np.concatenate(colors),
+    ).write(job.output, job.header)
+    before = sum(len(places) for places, _ in found.values())
+    print(f"{len(rows)} images, {before} places of matches merged into {count} keypoints")
+
+
+def _gather(paths: list[Path], images: set[int]) -> Mapping[int, tuple[Array, Array]]:
+    """Coordinates (N,2) and scores (N,) of the places of each image, from all pairs that it is in."""
+    parts: dict[int, list[tuple[Array, Array]]] = {image: [] for image in images}
+    for path in paths:
+        tile = PairCoordinates.read(path)
+        for row, pair in enumerate(tile.pairs.tolist()):
+            part = slice(tile.offsets[row], tile.offsets[row + 1])
+            for side, image in enumerate(pair):
+                if image in images:
+                    places = tile.coordinates[part, 2 * side : 2 * side + 2]
+                    parts[image].append((places, tile.scores[part]))
+    nothing = (np.zeros((0, 2), np.float32), np.zeros(0, np.float32))
+    return {
+        image: tuple(np.concatenate(column) for column in zip(nothing, *some, strict=True))  # type: ignore[misc]
+        for image, some in parts.items()
+    }
+
+
+def _read_colors(path: Path, keypoints: Array) -> Array:
+    """RGB of the image at the keypoints; black where it cannot be decoded."""
+    if len(keypoints) == 0:
+        return np.zeros((0, 3), np.uint8)
+    try:
+        image = read_image(path, COLOR_SIDE_PX)
+    except ImageError as error:
+        print(f"warning: {error}")
+        return np.zeros((len(keypoints), 3), np.uint8)
+    return sample_colors(image.rgb, keypoints / image.reduction)
