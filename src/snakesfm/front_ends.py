@@ -23,7 +23,6 @@ FRONT_ENDS: dict[str, FrontEnd] = {
     "superpoint+lightglue": FrontEnd("superpoint", "lightglue"),
     "superpoint+superglue": FrontEnd("superpoint", "superglue"),
     "loftr": FrontEnd("sift", "loftr"),
-    "efficientloftr": FrontEnd("sift", "efficientloftr"),
     "virtual": FrontEnd("virtual", "virtual"),
     "virtual_places": FrontEnd("sift", "virtual_places"),
     "imported": FrontEnd("imported", "imported"),
@@ -31,8 +30,8 @@ FRONT_ENDS: dict[str, FrontEnd] = {
 
 LEARNED_DESCRIPTORS = ("netvlad", "salad")
 LEARNED_DETECTORS = ("aliked", "disk", "xfeat", "superpoint")
-# matchers that find places in two images without keypoints; a detector then serves the choice of pairs alone
-DETECTOR_FREE = ("loftr", "efficientloftr", "virtual_places")
+# matchers that need no keypoints; a detector then serves the choice of pairs alone
+DETECTOR_FREE = ("loftr", "virtual_places")
 # the detectors whose keypoints a matcher understands; the others take any
 TRAINED_ON: dict[str, tuple[str, ...]] = {
     "lightglue": LEARNED_DETECTORS,
@@ -71,7 +70,7 @@ def needed_weights(stage: str, options: Any, detector: str) -> list[str]:
         return [options.method]
     if stage == "match_pairs" and options.method in ("lightglue", "superglue"):
         return [f"{detector}_{options.method}"]
-    if stage == "match_pairs" and options.method in ("loftr", "efficientloftr"):
+    if stage == "match_pairs" and options.method == "loftr":
         return [str(options.method)]
     if stage == "describe_images" and options.method in LEARNED_DESCRIPTORS:
         return [str(options.method)]

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from workflow_runner import Workflow, copy_run
 
-from snakesfm.artifacts import LocalFeatures, PairMatches
+from snakesfm.artifacts import LocalFeatures, PairCoordinates, PairMatches, TrackTable
 from snakesfm.evaluation.colmap_model import read_model
 
 pytestmark = pytest.mark.workflow
@@ -121,3 +121,86 @@ def test_superpoint_and_superglue_run_through_with_random_weights(
     tiles = [PairMatches.read(path) for path in sorted((out / "match_pairs").glob("*.h5"))]
     assert sum(len(tile.pairs) for tile in tiles) == 15
     assert all((np.diff(tile.offsets) > 0).all() for tile in tiles)
+
+
+def test_places_found_pair_by_pair_are_merged(
+    small_scene: Path, workflow: Workflow, tmp_path: Path
+) -> None:
+    config = ["front_end=virtual_places", f"cameras={small_scene / 'reference'}"]
+    metrics = run(workflow, small_scene, *config)
+    assert metrics["reference_images_registered"] == 16
+    # places are off by up to two pixels of a small image
+    assert 85 < metrics["pose_auc_1deg"] < 99.9 and 97 < metrics["pose_auc_5deg"] < 100
+    assert 3.5 < metrics["track_length_mean"] < 8
+    out = workflow.folder / "out" / "square"
+    tracks = TrackTable.read(out / "build_tracks" / "tracks.h5")
+    before, after = tracks.lengths_unmerged, tracks.lengths_merged
+    # nearly every track of two images: what must not reach the model
+    assert before[2] > 0.99 * before.sum() > 1000
+    assert after[2] < 0.3 * after.sum() and after @ np.arange(len(after)) > 3.5 * after.sum()
+    page = (out / "render_report" / "index.html").read_text("utf-8")
+    assert "inlier matches joined as they were found" in page and "in merged keypoints" in page
+
+    # other blocks and other pairs' places stay what they were
+    (tmp_path / "blocks").mkdir()
+    other = Workflow(tmp_path / "blocks")
+    assert run(other, small_scene, *config, "blocks=3") == metrics
+    by_image = [
+        {
+            (str(name), block.keypoints[block.offsets[row] : block.offsets[row + 1]].tobytes())
+            for path in sorted((folder / "merge_keypoints").glob("*.h5"))
+            for block in [LocalFeatures.read(path)]
+            for row, name in enumerate(block.names)
+        }
+        for folder in (out, other.folder / "out" / "square")
+    ]
+    assert by_image[0] == by_image[1] and len(by_image[0]) == 16
+
+    # another radius matches nothing anew, and a lost tile is taken over from its former file
+    outcome = workflow.run(
+        "--until",
+        "index_matches",
+        "--config",
+        f"images={small_scene / 'images'}",
+        f"reference={small_scene / 'reference'}",
+        "output=out",
+        *config,
+        "merge_keypoints={radius_px: 2}",
+    )
+    assert outcome.status == 0, outcome.text
+    assert set(outcome.rules) == {"merge_keypoints", "index_matches"}
+    (out / "match_pairs" / "0-1.h5").unlink()
+    run(workflow, small_scene, *config)
+    assert "60 pairs (60 taken over)" in (out / "logs" / "match_pairs" / "0-1.log").read_text()
+
+
+def test_loftr_runs_through_with_random_weights(small_scene: Path, workflow: Workflow) -> None:
+    torch = pytest.importorskip("torch", reason="the extra 'deep' is not installed")
+    pytest.importorskip("kornia", reason="the extra 'deep' is not installed")
+    from snakesfm.matching.detector_free import create_detector_free
+
+    (workflow.folder / "weights").mkdir()
+    torch.manual_seed(1)
+    network = create_detector_free("loftr", min_score=0.0, longer_side_px=128, state=None)._network
+    torch.save({"state_dict": network.state_dict()}, workflow.folder / "weights" / "loftr_outdoor.ckpt")
+    outcome = workflow.run(
+        "--until",
+        "index_matches",
+        "--config",
+        f"images={small_scene / 'images'}",
+        "output=out",
+        "front_end=loftr",
+        "select_pairs={method: sequential, look_ahead: 1}",
+        "match_pairs={min_score: 0.0, longer_side_px: 128}",
+    )
+    assert outcome.status == 0, outcome.text
+    # keypoints are found by no detector
+    assert "extract_features" not in outcome.rules
+    out = workflow.folder / "out" / "square"
+    found = [PairCoordinates.read(path) for path in sorted((out / "match_pairs").glob("*.h5"))]
+    tiles = [PairMatches.read(path) for path in sorted((out / "index_matches").glob("*.h5"))]
+    assert sum(len(tile.pairs) for tile in tiles) == 15
+    assert sum(len(tile.scores) for tile in found) > 15
+    for coordinates, tile in zip(found, tiles, strict=True):
+        np.testing.assert_array_equal(coordinates.pairs, tile.pairs)
+        assert (np.diff(tile.offsets) <= np.diff(coordinates.offsets)).all()

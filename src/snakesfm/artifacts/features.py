@@ -8,7 +8,7 @@ from snakesfm.artifacts.base import Array, Artifact, column
 
 @dataclass(frozen=True)
 class LocalFeatures(Artifact):
-    """Keypoints and descriptors of the images of one block, flat with row offsets; merged ones have D = 0."""
+    """Keypoints and descriptors of the images of one block, flat with row offsets; D = 0 where merged."""
 
     kind: ClassVar[str] = "local_features"
     format_version: ClassVar[int] = 2

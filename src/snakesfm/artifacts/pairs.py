@@ -53,7 +53,7 @@ class PairMatches(Artifact):
 
 @dataclass(frozen=True)
 class PairCoordinates(Artifact):
-    """Places that match in the pairs of one tile, as a detector-free matcher finds them: no keypoints yet."""
+    """Places that match in the pairs of one tile, as found without keypoints."""
 
     kind: ClassVar[str] = "pair_coordinates"
 

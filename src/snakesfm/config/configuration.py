@@ -77,7 +77,6 @@ FrontEndName = Literal[
     "superpoint+lightglue",
     "superpoint+superglue",
     "loftr",
-    "efficientloftr",
     "virtual",
     "virtual_places",
     "imported",

@@ -20,7 +20,6 @@ class MatchPairsOptions(StageOptions):
         "virtual",
         "imported",
         "loftr",
-        "efficientloftr",
         "virtual_places",
     ] = "mutual_ratio"
     """Nearest neighbours, a network, an oracle, hloc's file, or a matcher without keypoints."""

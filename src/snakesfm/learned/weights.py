@@ -103,11 +103,6 @@ WEIGHT_FILES: dict[str, WeightFile] = {
         "Apache-2.0",
         url="https://huggingface.co/kornia/loftr/resolve/main/loftr_outdoor.ckpt",
     ),
-    "efficientloftr": WeightFile(
-        "efficientloftr.safetensors",
-        "Apache-2.0",
-        url="https://huggingface.co/zju-community/efficientloftr/resolve/main/model.safetensors",
-    ),
 }
 
 

@@ -70,7 +70,6 @@ def _lazy(module: str, name: str) -> Callable[..., DetectorFreeMatcher]:
 
 DETECTOR_FREE_MATCHERS: dict[str, Callable[..., DetectorFreeMatcher]] = {
     "loftr": _lazy("loftr", "LoftrMatcher"),
-    "efficientloftr": _lazy("loftr", "EfficientLoftrMatcher"),
     "virtual_places": _lazy("virtual_places", "VirtualPlaces"),
 }
 

@@ -1,4 +1,4 @@
-"""LoFTR (Sun et al. 2021) by kornia and EfficientLoFTR (Wang et al. 2024) by transformers: no keypoints."""
+"""LoFTR (Sun et al. 2021), by kornia: a network that matches images without keypoints."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -93,56 +93,6 @@ class LoftrMatcher:
         one = to_array(found["keypoints0"], np.float64) * first.ratios
         other = to_array(found["keypoints1"], np.float64) * second.ratios
         return _inside(one, other, to_array(found["confidence"], np.float32), first, second)
-
-
-class EfficientLoftrMatcher:
-    """EfficientLoFTR, several times as fast as LoFTR.
-
-    Parameters
-    ----------
-    min_score : least confidence of a match, 0 .. 1.
-    longer_side_px : larger images are scaled down to this.
-    state : weights under the names of transformers; None for random ones.
-    """
-
-    multiple = 32
-
-    def __init__(self, min_score: float, longer_side_px: int, state: Mapping[str, Any] | None) -> None:
-        from transformers import EfficientLoFTRConfig, EfficientLoFTRForKeypointMatching
-
-        config = EfficientLoFTRConfig(coarse_matching_threshold=min_score)
-        network = EfficientLoFTRForKeypointMatching(config)
-        self._network = fill_network(network, state, "EfficientLoFTR", ("inv_freq",))
-        self._longer_side_px = longer_side_px
-        self._min_score = min_score
-
-    def prepare(self, first: Picture) -> PreparedPicture:
-        """See :class:`snakesfm.matching.detector_free.DetectorFreeMatcher`."""
-        return shrink(first, self._longer_side_px, self.multiple)
-
-    prepare_second = prepare
-
-    def match(self, first: PreparedPicture, second: PreparedPicture) -> tuple[Array, Array]:
-        """See :class:`snakesfm.matching.detector_free.DetectorFreeMatcher`."""
-        if first.gray is None or second.gray is None:
-            return no_coordinates()
-        torch = load_torch()
-        shape = np.maximum(first.gray.shape, second.gray.shape)
-        planes = []
-        for gray in (first.gray, second.gray):
-            # both images are given as one tensor; what is added on the right and below is black
-            padded = np.zeros(tuple(shape), np.uint8)
-            padded[: gray.shape[0], : gray.shape[1]] = gray
-            planes.append(to_tensor(padded).expand(1, 3, -1, -1))
-        with torch.inference_mode():
-            found = self._network(torch.stack(planes, dim=1))
-        partners = found.matches[0].cpu().numpy()
-        confidence = to_array(found.matching_scores[0], np.float32)
-        rows = np.flatnonzero((partners[0] >= 0) & (confidence[0] > self._min_score))
-        places = to_array(found.keypoints[0], np.float64) * shape[::-1]
-        one = places[0, rows] * first.ratios
-        other = places[1, partners[0, rows]] * second.ratios
-        return _inside(one, other, confidence[0, rows], first, second)
 
 
 def _inside(

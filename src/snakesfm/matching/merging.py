@@ -1,9 +1,9 @@
 """Keypoints out of the coordinates that a detector-free matcher gives pair by pair.
 
-Such a matcher finds a place anew in every pair, up to some pixels from where it found it in another pair. If
-every coordinate were a keypoint, nearly every track would end after two images. Coordinates of one image are
-therefore merged over all its pairs, and the pairs are then expressed in the merged keypoints (Sun et al. 2021,
-"LoFTR", section 4.4, and hloc do the like on a grid).
+Such a matcher finds a place anew in every pair, up to some pixels from where it found it in another pair.
+If every coordinate were a keypoint, nearly every track would end after two images. Coordinates of one image
+are therefore merged over all its pairs, and the pairs are then expressed in the merged keypoints; hloc
+(Sarlin et al. 2019) does the like on a grid.
 """
 
 from typing import Any

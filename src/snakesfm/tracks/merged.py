@@ -36,9 +36,8 @@ def compare_track_lengths(
     raw, merged = [np.zeros((0, 2, 3))], [np.zeros((0, 2, 3))]
     for row, (i, j) in enumerate(pairs.tolist()):
         inliers = matches[offsets[row] : offsets[row + 1]].astype(np.int64)
-        merged.append(
-            _ends(i, j, *(np.pad(inliers[:, side : side + 1], ((0, 0), (0, 1))) for side in (0, 1)))
-        )
+        rows = np.stack([inliers, np.zeros_like(inliers)], axis=2)
+        merged.append(_ends(i, j, rows[:, 0], rows[:, 1]))
         places = found(i, j)
         first = trees[i].nearest(places[:, :2], np.inf)
         second = trees[j].nearest(places[:, 2:], np.inf)
@@ -58,13 +57,9 @@ def describe_lengths(histogram: Array) -> str:
 
 def _ends(i: int, j: int, first: Array, second: Array) -> Array:
     """Both ends (M,2,3) of matches: the image and two numbers that tell its places apart."""
-    return np.stack(
-        [
-            np.insert(first.astype(np.float64), 0, i, axis=1),
-            np.insert(second.astype(np.float64), 0, j, axis=1),
-        ],
-        axis=1,
-    )
+    sides = ((i, first), (j, second))
+    ends = [np.insert(part.astype(np.float64), 0, image, axis=1) for image, part in sides]
+    return np.stack(ends, axis=1)
 
 
 def _lengths(ends: Array) -> Array:

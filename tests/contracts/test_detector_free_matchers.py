@@ -1,0 +1,131 @@
+"""What every matcher without keypoints must do."""
+
+from typing import ClassVar
+
+import numpy as np
+import pytest
+from contracts.test_detectors import shapes
+
+from snakesfm.evaluation.colmap_model import read_model
+from snakesfm.features.virtual import VirtualKeypoints
+from snakesfm.matching.detector_free import DETECTOR_FREE_MATCHERS, Picture, create_detector_free
+from snakesfm.synthetic.render_demo import make_demo
+from snakesfm.synthetic.scene import DemoOptions
+
+
+def picture(gray, name, reduction=1):
+    size = (gray.shape[1] * reduction, gray.shape[0] * reduction)
+    return Picture(name, size, gray, np.repeat(gray[..., None], 3, axis=2))
+
+
+class DetectorFreeContract:
+    """Inherit, set ``method``, and give a matcher and three pictures of which the first two match."""
+
+    method = ""
+
+    @pytest.fixture
+    def matcher(self):
+        raise NotImplementedError
+
+    @pytest.fixture
+    def pictures(self):
+        raise NotImplementedError
+
+    @staticmethod
+    def match(matcher, first, second):
+        return matcher.match(matcher.prepare(first), matcher.prepare_second(second))
+
+    def test_is_registered(self):
+        assert self.method in DETECTOR_FREE_MATCHERS
+
+    def test_places_lie_in_their_images(self, matcher, pictures):
+        coordinates, scores = self.match(matcher, pictures[0], pictures[1])
+        assert coordinates.dtype == np.float32 and scores.dtype == np.float32
+        assert coordinates.shape == (len(scores), 4) and len(scores) > 5
+        assert ((scores >= 0) & (scores <= 1)).all()
+        for part, image in ((coordinates[:, :2], pictures[0]), (coordinates[:, 2:], pictures[1])):
+            assert (part >= 0).all() and (part < image.size).all()
+
+    def test_a_pair_does_not_depend_on_the_pairs_before_it(self, matcher, pictures):
+        prepared, second = matcher.prepare(pictures[0]), matcher.prepare_second(pictures[1])
+        expected = matcher.match(prepared, second)
+        matcher.match(prepared, matcher.prepare_second(pictures[2]))
+        for one, other in zip(expected, matcher.match(prepared, second), strict=True):
+            np.testing.assert_array_equal(one, other)
+
+    @pytest.mark.parametrize("shape", [(1, 1), (40, 300), (240, 320)])
+    def test_an_image_that_shows_nothing_matches_nothing(self, matcher, pictures, shape):
+        black = picture(np.zeros(shape, np.uint8), "black")
+        for first, second in ((black, pictures[0]), (pictures[0], black), (black, black)):
+            coordinates, scores = self.match(matcher, first, second)
+            assert coordinates.shape == (0, 4) and scores.shape == (0,)
+            assert coordinates.dtype == np.float32 and scores.dtype == np.float32
+
+
+class TestLoftr(DetectorFreeContract):
+    """With random weights: shapes, pixels and independence, not how good its matches are."""
+
+    method = "loftr"
+    made: ClassVar[dict] = {}
+
+    @pytest.fixture
+    def matcher(self):
+        torch = pytest.importorskip("torch", reason="the extra 'deep' is not installed")
+        pytest.importorskip("kornia", reason="the extra 'deep' is not installed")
+        if not self.made:
+            torch.manual_seed(1)
+            self.made["loftr"] = create_detector_free(
+                "loftr", min_score=0.0, longer_side_px=128, state=None
+            )
+        return self.made["loftr"]
+
+    @pytest.fixture
+    def pictures(self):
+        grays = (shapes(128, 96)[0], shapes(104, 120)[0], shapes(128, 96, seed=8)[0])
+        return [picture(gray, str(number)) for number, gray in enumerate(grays)]
+
+    def test_places_are_those_of_the_original(self, matcher, pictures):
+        gray = pictures[0].gray
+        expected, _ = self.match(matcher, pictures[0], pictures[0])
+        coordinates, _ = self.match(matcher, picture(gray, "a", 3), picture(gray, "b", 2))
+        assert len(expected) > 5
+        np.testing.assert_allclose(coordinates, expected * [3, 3, 2, 2], rtol=1e-5)
+
+    def test_the_first_place_is_a_corner_of_a_coarse_cell(self, matcher, pictures):
+        coordinates, _ = self.match(matcher, pictures[0], pictures[2])
+        np.testing.assert_allclose(coordinates[:, :2] % 8, 0, atol=1e-4)
+
+
+class TestVirtualPlaces(DetectorFreeContract):
+    method = "virtual_places"
+    spread_px, noise_px = 2.0, 0.3
+
+    @pytest.fixture
+    def model(self, tmp_path):
+        folder = tmp_path / "square"
+        make_demo(folder, DemoOptions(image_count=16, width=100, height=75))
+        return read_model(folder / "reference")
+
+    @pytest.fixture
+    def matcher(self, model):
+        return create_detector_free(
+            "virtual_places", model=model, spread_px=self.spread_px, noise_px=self.noise_px, seed=1
+        )
+
+    @pytest.fixture
+    def pictures(self, model):
+        names = sorted(image.name for image in model.images.values())
+        return [picture(np.full((75, 100), 9, np.uint8), name) for name in names[:3]]
+
+    def test_places_are_near_the_points_that_both_images_see(self, matcher, pictures, model):
+        known = VirtualKeypoints(model)
+        coordinates, _ = self.match(matcher, pictures[0], pictures[1])
+        for part, image in ((coordinates[:, :2], pictures[0]), (coordinates[:, 2:], pictures[1])):
+            points = known.read(image.name, image.size).keypoints
+            distance = np.linalg.norm(part[:, None] - points[None], axis=2).min(axis=1)
+            assert distance.max() <= np.sqrt(2) * (self.spread_px + 5 * self.noise_px)
+        assert len(coordinates) > 20
+
+    def test_every_pair_finds_other_places(self, matcher, pictures):
+        places = [self.match(matcher, pictures[0], second)[0][:, :2] for second in pictures[1:]]
+        assert not set(map(tuple, places[0].tolist())) & set(map(tuple, places[1].tolist()))
