@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 from snakesfm.errors import ConfigError
 
@@ -28,8 +27,9 @@ FRONT_ENDS: dict[str, FrontEnd] = {
     "imported": FrontEnd("imported", "imported"),
 }
 
-LEARNED_DESCRIPTORS = ("netvlad", "salad")
+LEARNED_DESCRIPTORS = ("netvlad", "megaloc")
 LEARNED_DETECTORS = ("aliked", "disk", "xfeat", "superpoint")
+LEARNED_METHODS = (*LEARNED_DETECTORS, "lightglue", "superglue", "loftr", *LEARNED_DESCRIPTORS)
 # matchers that need no keypoints; a detector then serves the choice of pairs alone
 DETECTOR_FREE = ("loftr", "virtual_places")
 # the detectors whose keypoints a matcher understands; the others take any
@@ -57,37 +57,41 @@ def check_methods(detector: str, matcher: str) -> None:
         )
 
 
-def needed_weights(stage: str, options: Any, detector: str) -> list[str]:
+def needed_weights(stage: str, method: str, detector: str) -> list[str]:
     """The models whose weight files a stage reads, keys of ``learned.weights.WEIGHT_FILES``.
 
     Parameters
     ----------
     stage : name of the stage.
-    options : its options.
+    method : its method.
     detector : the method of extract_features.
     """
-    if stage == "extract_features" and options.method in LEARNED_DETECTORS:
-        return [options.method]
-    if stage == "match_pairs" and options.method in ("lightglue", "superglue"):
-        return [f"{detector}_{options.method}"]
-    if stage == "match_pairs" and options.method == "loftr":
-        return [str(options.method)]
-    if stage == "describe_images" and options.method in LEARNED_DESCRIPTORS:
-        return [str(options.method)]
+    known = {
+        "extract_features": LEARNED_DETECTORS,
+        "match_pairs": ("loftr",),
+        "describe_images": LEARNED_DESCRIPTORS,
+    }
+    if method in known.get(stage, ()):
+        return [method]
+    if stage == "match_pairs" and method in ("lightglue", "superglue"):
+        return [f"{detector}_{method}"]
     return []
 
 
-def fetch_command(front_end: str, methods: Mapping[str, str], weights: str, images: str) -> str:
+def fetch_command(front_end: str, methods: Mapping[str, str], weights: str) -> str:
     """The command that fetches the weights of a run.
 
     Parameters
     ----------
     front_end : name of the front-end, or "" where the methods were named.
-    methods : method by stage.
-    weights, images : the run's folders.
+    methods : method by stage, of the stages that may have a network.
+    weights : the run's folder of weights.
     """
-    if front_end:
-        chosen = [f"front_end={front_end}"]
-    else:
-        chosen = [f"'{stage}={{method: {method}}}'" for stage, method in methods.items()]
-    return " ".join(["snakemake fetch_weights --config", *chosen, f"weights={weights}", f"images={images}"])
+    named = {stage: method for stage, method in methods.items() if method in LEARNED_METHODS}
+    chosen = [f"front_end={front_end}"] if front_end else []
+    chosen += [
+        f"'{stage}={{method: {method}}}'"
+        for stage, method in named.items()
+        if not front_end or stage not in ("extract_features", "match_pairs")
+    ]
+    return " ".join(["snakemake fetch_weights --config", *chosen, f"weights={weights}"])

@@ -17,7 +17,14 @@ from snakesfm.config.match_pairs import MatchPairsOptions
 from snakesfm.config.select_pairs import SelectPairsOptions
 from snakesfm.digests import options_digest
 from snakesfm.errors import ConfigError
-from snakesfm.front_ends import DETECTOR_FREE, FRONT_ENDS, check_methods, fetch_command, needed_weights
+from snakesfm.front_ends import (
+    DETECTOR_FREE,
+    FRONT_ENDS,
+    LEARNED_DESCRIPTORS,
+    check_methods,
+    fetch_command,
+    needed_weights,
+)
 from snakesfm.ingest.discover import count_images, fingerprint_images
 from snakesfm.resources import Load, job_load
 
@@ -61,7 +68,21 @@ class ScenePlan:
         self.configuration = configuration
         self.folder = output / name
         check_methods(self.method("extract_features"), self.method("match_pairs"))
+
+    def check(self) -> None:
+        """Refuse paths that are not there, or whose files do not serve.
+
+        Raises
+        ------
+        ConfigError : says which and what to do.
+        """
         self._check_paths()
+        models = [model for stage in STAGES for model in self.models(stage)]
+        if len(models) > 1 and self.weights.is_file():
+            raise ConfigError(
+                f"weights={self.weights} is one file, but scene '{self.name}' needs those of "
+                f"{len(models)} networks ({', '.join(models)}): give a folder that holds them all."
+            )
 
     def _check_paths(self) -> None:
         images = Path(self.inputs.images).expanduser()
@@ -108,10 +129,10 @@ class ScenePlan:
                 )
 
     def method(self, stage: str) -> str:
-        """The method of extract_features or match_pairs, by the front-end's name where one is given."""
+        """The method of a stage, by the front-end's name where one is given."""
         front_end = FRONT_ENDS.get(self.configuration.front_end)
-        if front_end is None:
-            return str(getattr(self.configuration, stage).method)
+        if front_end is None or stage not in ("extract_features", "match_pairs"):
+            return str(getattr(getattr(self.configuration, stage), "method", ""))
         return front_end.detector if stage == "extract_features" else front_end.matcher
 
     @property
@@ -160,7 +181,21 @@ class ScenePlan:
 
     def models(self, stage: str) -> list[str]:
         """The networks whose weights a stage reads."""
-        return needed_weights(stage, self.options(stage), self.method("extract_features"))
+        if stage == "describe_images" and not self.select_pairs.needs_descriptors:
+            return []
+        if stage == "extract_features" and not self.detects_keypoints:
+            return []
+        return self.possible_models(stage)
+
+    def possible_models(self, stage: str) -> list[str]:
+        """The networks whose weights a stage reads if it runs at all."""
+        return needed_weights(stage, self.method(stage), self.method("extract_features"))
+
+    @property
+    def detects_keypoints(self) -> bool:
+        """Whether extract_features runs: for the matching, or for the choice of pairs."""
+        by_keypoints = self.select_pairs.needs_descriptors and not self.describes_pictures
+        return not self.detector_free or by_keypoints
 
     @property
     def weights(self) -> Path:
@@ -191,14 +226,14 @@ class ScenePlan:
         # imported here, as most runs have no networks and every job parses the Snakefile
         from snakesfm.learned.weights import weights_digest
 
-        methods = {name: self.method(name) for name in ("extract_features", "match_pairs")}
+        names = ("extract_features", "describe_images", "match_pairs")
+        methods = {name: self.method(name) for name in names}
         return {
             "weights": str(self.weights),
             "models": models,
             "weights_content": weights_digest(models, self.weights) if main_process else "",
-            "fetch": fetch_command(
-                self.configuration.front_end, methods, str(self.weights), str(self.images)
-            ),
+            "fetch": fetch_command(self.configuration.front_end, methods, str(self.weights)),
+            "device": self.configuration.device,
         }
 
     def files(self, stage: str, parts: str) -> list[str]:
@@ -234,6 +269,15 @@ class ScenePlan:
     def global_descriptors(self) -> list[str]:
         """The global descriptors of all blocks where pairs are retrieved, else nothing."""
         return self.files("describe_images", "blocks") if self.select_pairs.needs_descriptors else []
+
+    @property
+    def describes_pictures(self) -> bool:
+        """Whether a network describes the images themselves, instead of their local descriptors."""
+        return self.method("describe_images") in LEARNED_DESCRIPTORS
+
+    def vocabulary(self) -> list[str]:
+        """The codebook of local descriptors where they describe the images, else nothing."""
+        return [] if self.describes_pictures else [str(self.folder / "learn_vocabulary" / "vocabulary.h5")]
 
     @functools.cached_property
     def pair_count(self) -> int:
@@ -277,8 +321,7 @@ class ScenePlan:
         ):
             files += self.files(stage, "tiles")
         if self.select_pairs.needs_descriptors:
-            files.append(str(self.folder / "learn_vocabulary" / "vocabulary.h5"))
-            files += self.files("describe_images", "blocks")
+            files += [*self.vocabulary(), *self.files("describe_images", "blocks")]
         return files + self.final_files()
 
     @functools.cached_property
@@ -307,6 +350,9 @@ class ScenePlan:
             if self.detector_free:
                 return {"images": str(self.images)} | known
             return {"detector": self.method("extract_features")} | known
+        if stage == "describe_images" and self.describes_pictures:
+            settings = {"images": str(self.images), "block": int(wildcards["block"])}
+            return settings | self.weight_settings(stage, main_process)
         if stage == "merge_keypoints":
             return {"images": str(self.images), "block": int(wildcards["block"])}
         if stage == "select_pairs":
@@ -382,23 +428,37 @@ def _file_state(path: Path) -> str:
 
 
 class Plan:
-    """All scenes of a run."""
+    """All scenes of a run.
 
-    def __init__(self, config: Mapping[str, Any]) -> None:
+    Parameters
+    ----------
+    config : the configuration as Snakemake has it.
+    weights_only : the run just fetches weights, so no scene is planned and no images need be there.
+    """
+
+    def __init__(self, config: Mapping[str, Any], weights_only: bool = False) -> None:
         configuration = load_configuration(config)
         self.output = Path(configuration.output).expanduser()
         self.weights = Path(configuration.weights).expanduser()
-        _check_writable(self.output)
-        self.scenes = {
+        self.weights_only = weights_only
+        planned = {
             name: ScenePlan(name, inputs, configuration, self.output)
             for name, inputs in list_scenes(configuration).items()
         }
-
-    @property
-    def models(self) -> list[str]:
-        """The networks whose weights any scene's stages read."""
-        found = {name for scene in self.scenes.values() for stage in STAGES for name in scene.models(stage)}
-        return sorted(found)
+        # the networks whose weights any scene's stages may read
+        self.models = sorted(
+            {
+                name
+                for scene in planned.values()
+                for stage in STAGES
+                for name in scene.possible_models(stage)
+            }
+        )
+        self.scenes = {} if weights_only else planned
+        if not weights_only:
+            _check_writable(self.output)
+        for scene in self.scenes.values():
+            scene.check()
 
     def scenes_by_blocks(self) -> dict[int, list[str]]:
         """The names of the scenes that have each number of blocks."""

@@ -41,6 +41,8 @@ class Run:
         ConfigError : another run is writing to the folder, or the folder cannot be written, or SLURM jobs
             of an interrupted run cannot be ended.
         """
+        if self.plan.weights_only:
+            return
         path = self.plan.output / LOCK_NAME
         try:
             self.plan.output.mkdir(parents=True, exist_ok=True)
@@ -110,6 +112,8 @@ class Run:
 
     def finish(self) -> None:
         """One line per scene about its model."""
+        if self.plan.weights_only:
+            return
         _cancel_timers()
         self._note("")
         for scene in self.plan.scenes.values():
@@ -117,6 +121,8 @@ class Run:
 
     def fail(self) -> None:
         """One line per scene: its model where it has one, else the sentences of its failed jobs."""
+        if self.plan.weights_only:
+            return
         _cancel_timers()
         with contextlib.suppress(OSError, subprocess.SubprocessError):
             if not self.slurm_run or not slurm.list_jobs(self.slurm_run):

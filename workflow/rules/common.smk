@@ -14,7 +14,9 @@ from snakesfm.plan import Plan, tile_names
 from snakesfm.run import Run
 
 try:
-    PLAN = Plan(config)
+    # Snakemake knows its targets only later, and this one needs no images
+    asked = {argument.split(":")[0] for argument in sys.argv[1:]}
+    PLAN = Plan(config, weights_only="fetch_weights" in asked)
 except SnakesfmError as error:
     raise WorkflowError(str(error)) from None
 RUN = Run(PLAN)
@@ -112,6 +114,25 @@ def block_tiles(wildcards):
 def global_descriptors(wildcards):
     """The global descriptors of all blocks where pairs are retrieved, else nothing."""
     return PLAN.scenes[wildcards.scene].global_descriptors()
+
+
+def described_features(wildcards):
+    """A block's local features where these describe its images, else nothing."""
+    scene = PLAN.scenes[wildcards.scene]
+    block = str(scene.folder / "extract_features" / f"{wildcards.block}.h5")
+    return [] if scene.describes_pictures else [block]
+
+
+def described_images(wildcards):
+    """The index where a network describes the images themselves, else nothing."""
+    scene = PLAN.scenes[wildcards.scene]
+    index = str(scene.folder / "index_images" / "index.h5")
+    return [index] if scene.describes_pictures else []
+
+
+def vocabulary_file(wildcards):
+    """The codebook where local features describe the images, else nothing."""
+    return PLAN.scenes[wildcards.scene].vocabulary()
 
 
 def any_of(names):

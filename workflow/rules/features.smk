@@ -42,8 +42,9 @@ rule learn_vocabulary:
 
 rule describe_images:
     input:
-        features=artifact("extract_features", "{block}.h5"),
-        vocabulary=artifact("learn_vocabulary", "vocabulary.h5"),
+        features=described_features,
+        vocabulary=vocabulary_file,
+        index=described_images,
     output:
         artifact("describe_images", "{block}.h5"),
     log:
@@ -51,6 +52,7 @@ rule describe_images:
     benchmark:
         benchmark_file("describe_images", "{block}")
     resources:
+        gpu=gpus("describe_images"),
         mem_mb=memory_mb("describe_images"),
         runtime=runtime_min("describe_images"),
     params:

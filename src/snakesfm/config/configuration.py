@@ -107,7 +107,9 @@ class RunOptions(BaseModel):
     front_end: FrontEndName = ""
     """Detector and matcher by one name; empty takes the methods of extract_features and match_pairs."""
     weights: str = "weights"
-    """Folder of the learned methods' weights, filled by 'snakemake fetch_weights'; jobs never download."""
+    """Folder (or one file) of weights, filled by 'snakemake fetch_weights'; jobs never download."""
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    """Where networks run: on a CUDA device if there is one, on the processor, or on CUDA or not at all."""
     scenes: dict[str, SceneInputs] = Field(default_factory=dict)
     """Several scenes: a mapping from name to images, reference, cameras, intrinsics and pairs."""
     seed: int = Field(default=0, ge=0)

@@ -1,6 +1,6 @@
 """Options of describe_images."""
 
-from typing import ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 
@@ -12,11 +12,14 @@ class DescribeImagesOptions(StageOptions):
 
     stage_version: ClassVar[int] = 1
 
-    method: Literal["vlad"] = "vlad"
-    """Global descriptor: VLAD of the local descriptors."""
+    method: Literal["vlad", "netvlad", "megaloc"] = "vlad"
+    """Global descriptor: VLAD of the local descriptors, or a network of the whole image."""
 
     largest_share: float = Field(0.3, gt=0.0, le=1.0)
     """Share of each image's keypoints that takes part, those of largest scale first."""
 
     power: float = Field(0.5, gt=0.0, le=1.0)
     """Exponent of the power normalisation of the vector's entries (1 switches it off)."""
+
+    longer_side_px: Annotated[int, Field(ge=28, le=20_000)] | Literal["auto"] = "auto"
+    """Longer side to which a network's images are scaled down; 'auto': netvlad 640, megaloc 322."""

@@ -18,7 +18,7 @@ def read_checkpoint(model: str, folder: Path, command: str) -> Mapping[str, Any]
     Parameters
     ----------
     model : key of ``WEIGHT_FILES``.
-    folder : the weights folder.
+    folder : the weights folder, whose files are the known ones; or a file of the user's own choice.
     command : what fetches the weights, for the error's sentence.
 
     Returns
@@ -30,7 +30,9 @@ def read_checkpoint(model: str, folder: Path, command: str) -> Mapping[str, Any]
     ConfigError : the file is missing, is not the known one, or holds no weights; or there is no torch.
     """
     path = find_weights(model, folder, command)
-    expected = WEIGHT_FILES[model].sha256 or read_sums(folder).get(path.name, "")
+    expected = ""
+    if not folder.is_file():
+        expected = WEIGHT_FILES[model].sha256 or read_sums(folder).get(path.name, "")
     if expected and file_sha256(path) != expected:
         raise ConfigError(
             f"{path} is not the known file of '{model}' (its SHA-256 differs): remove it and run "
@@ -42,6 +44,8 @@ def read_checkpoint(model: str, folder: Path, command: str) -> Mapping[str, Any]
             from safetensors.torch import load_file
 
             return dict(load_file(path))
+        if path.suffix == ".mat":
+            return _read_matlab(path)
         content = torch.load(path, map_location="cpu", weights_only=True)
         for key in CONTAINERS:
             if isinstance(content, Mapping) and isinstance(content.get(key), Mapping):
@@ -52,6 +56,22 @@ def read_checkpoint(model: str, folder: Path, command: str) -> Mapping[str, Any]
         raise ConfigError(
             f"{path} holds no weights that torch can read ({reason}): remove it and run '{command}'."
         ) from None
+
+
+def _read_matlab(path: Path) -> Mapping[str, Any]:
+    """Weights of MatConvNet as ``layers.K.weights.W``, and the mean colour as ``mean``, float32."""
+    import numpy as np
+    from scipy.io import loadmat
+
+    torch = load_torch()
+    network = loadmat(path, struct_as_record=False, squeeze_me=True)["net"]
+    state = {}
+    for number, layer in enumerate(network.layers):
+        for part, weights in enumerate(np.atleast_1d(getattr(layer, "weights", ()))):
+            values = np.ascontiguousarray(weights, np.float32)
+            state[f"layers.{number}.weights.{part}"] = torch.from_numpy(values)
+    colour = np.asarray(network.meta.normalization.averageImage, np.float32).reshape(-1, 3)[0]
+    return {**state, "mean": torch.from_numpy(np.ascontiguousarray(colour))}
 
 
 def fill_network(

@@ -22,10 +22,29 @@ def load_torch() -> Any:
         ) from None
 
 
+_wanted = "auto"
+
+
+def use_device(wanted: str) -> None:
+    """Let this process's networks run on 'cpu', on 'cuda', or with 'auto' on CUDA where there is some.
+
+    Raises
+    ------
+    ConfigError : CUDA is wanted and there is none.
+    """
+    global _wanted
+    if wanted == "cuda" and not load_torch().cuda.is_available():
+        raise ConfigError(
+            "device is 'cuda', but the job finds no CUDA device: ask the cluster for one with "
+            "--profile profiles/slurm-gpu on a partition that has GPUs, or say device=cpu."
+        )
+    _wanted = wanted
+
+
 def choose_device() -> Any:
-    """The first CUDA device where there is one, else the processor."""
+    """The first CUDA device where there is one and the run wants it, else the processor."""
     torch = load_torch()
-    return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    return torch.device("cuda" if _wanted != "cpu" and torch.cuda.is_available() else "cpu")
 
 
 def use_threads(threads: int) -> None:

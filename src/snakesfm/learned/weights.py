@@ -103,7 +103,22 @@ WEIGHT_FILES: dict[str, WeightFile] = {
         "Apache-2.0",
         url="https://huggingface.co/kornia/loftr/resolve/main/loftr_outdoor.ckpt",
     ),
+    "netvlad": WeightFile(
+        "netvlad_pitts30k.mat",
+        "MIT",
+        url="https://cvg-data.inf.ethz.ch/hloc/netvlad/Pitts30K_struct.mat",
+    ),
+    "megaloc": WeightFile(
+        "megaloc.torch",
+        "MIT",
+        url="https://github.com/gmberton/MegaLoc/releases/download/v1.0/megaloc.torch",
+    ),
 }
+
+
+def weights_path(model: str, folder: Path) -> Path:
+    """Where the file of a model is: in the weights folder, or what is given instead of a folder."""
+    return folder if folder.is_file() else folder / WEIGHT_FILES[model].name
 
 
 def find_weights(model: str, folder: Path, command: str) -> Path:
@@ -112,14 +127,14 @@ def find_weights(model: str, folder: Path, command: str) -> Path:
     Parameters
     ----------
     model : key of ``WEIGHT_FILES``.
-    folder : the weights folder.
+    folder : the weights folder, or the file itself.
     command : what fetches the file, for the error's sentence.
 
     Raises
     ------
     ConfigError : it is not there.
     """
-    path = folder / WEIGHT_FILES[model].name
+    path = weights_path(model, folder)
     if not path.is_file():
         raise ConfigError(
             f"The weights of '{model}' are missing ({path}): fetch them once where there is internet with "
@@ -159,6 +174,6 @@ def weights_digest(models: Iterable[str], folder: Path) -> str:
     """
     parts = []
     for model in sorted(set(models)):
-        path = folder / WEIGHT_FILES[model].name
+        path = weights_path(model, folder)
         parts.append(f"{model} {file_sha256(path) if path.is_file() else 'missing'}")
     return hashlib.sha256("\n".join(parts).encode()).hexdigest() if parts else ""

@@ -1,23 +1,40 @@
 """Sum up every image of one block in a global descriptor."""
 
-from typing import TYPE_CHECKING
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from snakesfm.artifacts.features import GlobalDescriptors, LocalFeatures, Vocabulary
+from snakesfm.artifacts.images import ImageIndex
+from snakesfm.errors import ImageError
+from snakesfm.ingest.read import read_image
 from snakesfm.retrieval.codebook import largest_rows
+from snakesfm.retrieval.descriptor import create_descriptor, describe_image
 from snakesfm.retrieval.vlad import describe_vlad
 from snakesfm.stages.job import StageJob
 
 if TYPE_CHECKING:
     from snakesfm.config.describe_images import DescribeImagesOptions
 
+Array = NDArray[Any]
+
 
 def run(job: StageJob) -> None:
     """Describe the images one by one and write their GlobalDescriptors."""
     options: DescribeImagesOptions = job.options
-    centers = Vocabulary.read(job.path("vocabulary")).centers
-    with LocalFeatures.open(job.path("features")) as file:
+    describe = _describe_local_features if options.method == "vlad" else _describe_pictures
+    image_ids, described = describe(job, options)
+    GlobalDescriptors(image_ids=image_ids, descriptors=described).write(job.output, job.header)
+    print(f"{len(image_ids)} images described by {described.shape[1]} numbers each")
+
+
+def _describe_local_features(job: StageJob, options: "DescribeImagesOptions") -> tuple[Array, Array]:
+    """Rows (n,) of the index and descriptors (n,D) of the block's images, from their keypoints."""
+    centers = Vocabulary.read(job.paths("vocabulary")[0]).centers
+    with LocalFeatures.open(job.paths("features")[0]) as file:
         image_ids, offsets, descriptors = file["image_ids"][()], file["offsets"][()], file["descriptors"]
         described = np.zeros((len(image_ids), centers.size), np.float32)
         progress = job.progress(len(image_ids), "images")
@@ -26,5 +43,24 @@ def run(job: StageJob) -> None:
             large = largest_rows(file["scales"][rows], options.largest_share)
             described[row] = describe_vlad(descriptors[rows][large], centers, options.power)
             progress.step()
-    GlobalDescriptors(image_ids=image_ids, descriptors=described).write(job.output, job.header)
-    print(f"{len(image_ids)} images described by {centers.size} numbers each")
+    return image_ids, described
+
+
+def _describe_pictures(job: StageJob, options: "DescribeImagesOptions") -> tuple[Array, Array]:
+    """The same from the images themselves; one that cannot be decoded resembles none."""
+    index = ImageIndex.read(job.paths("index")[0])
+    image_ids = np.flatnonzero(index.blocks == int(job.settings["block"]))
+    descriptor = create_descriptor(options.method, state=job.read_weights(options.method))
+    side = descriptor.usual_side_px if options.longer_side_px == "auto" else options.longer_side_px
+    described = np.zeros((len(image_ids), descriptor.size), np.float32)
+    progress = job.progress(len(image_ids), "images")
+    for row, image in enumerate(image_ids.tolist()):
+        width, height = index.sizes[image].tolist()
+        shorter = math.ceil(side * min(width, height) / max(width, height))
+        try:
+            pixels = read_image(Path(job.settings["images"]) / str(index.names[image]), shorter)
+            described[row] = describe_image(descriptor, pixels.rgb, side)
+        except ImageError as error:
+            print(f"warning: {error}")
+        progress.step()
+    return image_ids.astype(np.int32), described

@@ -105,12 +105,14 @@ class StageJob:
 
         Raises
         ------
-        ConfigError : they are not in the run's weights folder, or torch is not installed.
+        ConfigError : they are not in the run's weights folder, torch is not installed, or there is no CUDA
+            device where one is asked for.
         """
         from snakesfm.learned.checkpoints import read_checkpoint
-        from snakesfm.learned.device import use_threads
+        from snakesfm.learned.device import use_device, use_threads
 
         use_threads(self.threads)
+        use_device(str(self.settings.get("device", "auto")))
         return read_checkpoint(model, Path(self.settings["weights"]), self.settings["fetch"])
 
     def weights_digest(self) -> str:

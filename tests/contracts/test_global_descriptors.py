@@ -1,0 +1,164 @@
+"""What every network that describes whole images must do: with small random weights, as no real ones are here."""
+
+import cv2
+import numpy as np
+import pytest
+from contracts.test_detectors import shapes
+from random_weights import megaloc_state, write_netvlad
+
+from snakesfm.errors import ConfigError
+from snakesfm.learned.checkpoints import read_checkpoint
+from snakesfm.learned.weights import WEIGHT_FILES
+from snakesfm.retrieval.descriptor import DESCRIPTORS, create_descriptor, describe_image
+
+
+def colored(width=96, height=70, seed=3):
+    return np.stack([shapes(width, height, seed=seed + part)[0] for part in range(3)], axis=2)
+
+
+class GlobalDescriptorContract:
+    """Inherit, set ``method`` and write weights into a folder."""
+
+    method = ""
+
+    def write(self, path):
+        raise NotImplementedError
+
+    @pytest.fixture
+    def state(self, tmp_path):
+        pytest.importorskip("torch", reason="the extra 'deep' is not installed")
+        pytest.importorskip("transformers", reason="the extra 'deep' is not installed")
+        self.write(tmp_path / WEIGHT_FILES[self.method].name)
+        return read_checkpoint(self.method, tmp_path, "fetch")
+
+    @pytest.fixture
+    def descriptor(self, state):
+        return create_descriptor(self.method, state=state)
+
+    def test_is_registered(self, descriptor):
+        assert self.method in DESCRIPTORS
+        assert descriptor.multiple >= 1 and descriptor.usual_side_px >= 28
+
+    @pytest.mark.parametrize("shape", [(96, 70), (70, 96), (33, 131), (28, 28)])
+    def test_vectors_are_of_unit_length(self, descriptor, shape):
+        vector = describe_image(descriptor, colored(*shape), 112)
+        assert vector.shape == (descriptor.size,) and vector.dtype == np.float32
+        assert np.linalg.norm(vector) == pytest.approx(1, abs=1e-5)
+
+    def test_an_image_of_one_tone_resembles_none(self, descriptor):
+        assert not describe_image(descriptor, np.full((40, 60, 3), 7, np.uint8), 112).any()
+
+    def test_does_not_depend_on_the_images_before_it(self, descriptor):
+        expected = describe_image(descriptor, colored(), 112)
+        describe_image(descriptor, colored(60, 60, 9), 112)
+        np.testing.assert_array_equal(describe_image(descriptor, colored(), 112), expected)
+
+    def test_a_batch_gives_what_single_images_give(self, descriptor):
+        import torch
+
+        images = torch.stack(
+            [torch.from_numpy(colored(84, 56, seed)).permute(2, 0, 1).float() / 255 for seed in (1, 5)]
+        )
+        with torch.inference_mode():
+            together = descriptor.infer(images)
+            apart = torch.cat([descriptor.infer(image[None]) for image in images])
+        torch.testing.assert_close(together, apart, rtol=1e-4, atol=1e-5)
+        assert not torch.allclose(together[0], together[1], atol=1e-3)
+
+    def test_a_brighter_copy_is_nearer_than_another_image(self, descriptor):
+        image, other = colored(), colored(seed=40)
+        brighter = cv2.convertScaleAbs(image, alpha=0.9, beta=15)
+        vectors = [describe_image(descriptor, one, 112) for one in (image, brighter, other)]
+        assert 1 > vectors[0] @ vectors[1] > vectors[0] @ vectors[2]
+
+    def test_weights_of_another_network_are_refused(self, state):
+        with pytest.raises(ConfigError, match="fetch the right ones"):
+            create_descriptor(self.method, state=dict(list(state.items())[:5]))
+
+
+class TestNetvlad(GlobalDescriptorContract):
+    method = "netvlad"
+
+    def write(self, path):
+        write_netvlad(path)
+
+    def test_agrees_with_the_definition(self, descriptor, state):
+        import torch
+
+        image = colored(48, 32)
+        columns = torch.from_numpy(image).permute(2, 0, 1)[None].double()
+        values = {name: tensor.double() for name, tensor in state.items()}
+        x = columns - values["mean"].reshape(1, 3, 1, 1)
+        for place in (0, 2, 5, 7, 10, 12, 14, 17, 19, 21, 24, 26, 28):
+            if place in (5, 10, 17, 24):
+                x = torch.nn.functional.max_pool2d(x, 2)
+            kernel = values[f"layers.{place}.weights.0"].permute(3, 2, 0, 1)
+            x = torch.nn.functional.conv2d(x, kernel, values[f"layers.{place}.weights.1"], padding=1)
+            if place != 28:
+                x = x.relu()
+        local = x[0].flatten(1)
+        local = (local / local.norm(dim=0)).numpy()
+        logits = values["layers.30.weights.0"].numpy().T @ local
+        shares = np.exp(logits) / np.exp(logits).sum(axis=0)
+        centers = -values["layers.30.weights.1"].numpy()
+        vlad = np.zeros_like(centers)
+        for word in range(centers.shape[1]):
+            for place in range(local.shape[1]):
+                vlad[:, word] += shares[word, place] * (local[:, place] - centers[:, word])
+        vlad /= np.linalg.norm(vlad, axis=0)
+        flat = vlad.ravel() / np.linalg.norm(vlad)
+        whitened = flat @ values["layers.33.weights.0"].numpy().reshape(len(flat), -1)
+        whitened += values["layers.33.weights.1"].numpy()
+        expected = whitened / np.linalg.norm(whitened)
+        np.testing.assert_allclose(describe_image(descriptor, image, 112), expected, atol=2e-4)
+
+
+class TestMegaloc(GlobalDescriptorContract):
+    method = "megaloc"
+
+    def write(self, path):
+        import torch
+
+        torch.save(megaloc_state(), path)
+
+    def test_agrees_with_the_definition(self, descriptor, state):
+        import torch
+        from torch.nn import functional
+
+        image = colored(70, 70)
+        values = {name.removeprefix("backbone.model."): tensor for name, tensor in state.items()}
+        mean, deviation = torch.tensor([0.485, 0.456, 0.406]), torch.tensor([0.229, 0.224, 0.225])
+        x = ((torch.from_numpy(image).float() / 255 - mean) / deviation).permute(2, 0, 1)[None]
+        x = functional.conv2d(
+            x, values["patch_embed.proj.weight"], values["patch_embed.proj.bias"], stride=14
+        )
+        x = torch.cat([values["cls_token"], x.flatten(2).transpose(1, 2)], dim=1) + values["pos_embed"]
+
+        def linear(x, name):
+            return x @ values[f"{name}.weight"].flatten(1).T + values[f"{name}.bias"]
+
+        def norm(x, name):
+            weight, bias = values[f"{name}.weight"], values[f"{name}.bias"]
+            return functional.layer_norm(x, (64,), weight, bias, 1e-6)
+
+        for block in ("blocks.0.", "blocks.1."):
+            q, k, v = linear(norm(x, f"{block}norm1"), f"{block}attn.qkv").chunk(3, dim=-1)
+            attended = torch.softmax(q @ k.transpose(1, 2) / 8, dim=-1) @ v
+            x = x + values[f"{block}ls1.gamma"] * linear(attended, f"{block}attn.proj")
+            inner = functional.gelu(linear(norm(x, f"{block}norm2"), f"{block}mlp.fc1"))
+            x = x + values[f"{block}ls2.gamma"] * linear(inner, f"{block}mlp.fc2")
+        x = norm(x, "norm")[0]
+        start = "aggregator.agg."
+        scene = linear(linear(x[:1], f"{start}token_features.0").relu(), f"{start}token_features.2")[0]
+        features = linear(linear(x[1:], f"{start}cluster_features.0").relu(), f"{start}cluster_features.3")
+        scores = linear(linear(x[1:], f"{start}score.0").relu(), f"{start}score.3").T
+        clusters, patches = scores.shape
+        plan = torch.exp(torch.cat([scores, values[f"{start}dust_bin"].expand(1, patches)]))
+        rows = torch.cat([torch.ones(clusters), torch.tensor([float(patches - clusters)])])
+        for _ in range(3):
+            plan = plan * (rows / plan.sum(dim=1))[:, None]
+            plan = plan / plan.sum(dim=0)
+        summed = functional.normalize(features.T @ plan[:-1].T, dim=0).flatten()
+        joined = functional.normalize(torch.cat([functional.normalize(scene, dim=0), summed]), dim=0)
+        expected = functional.normalize(linear(joined, "aggregator.linear"), dim=0).numpy()
+        np.testing.assert_allclose(describe_image(descriptor, image, 70), expected, atol=1e-5)
