@@ -79,6 +79,8 @@ for blocks, scenes in PLAN.scenes_by_blocks().items():
             benchmark_file("select_pairs")
         wildcard_constraints:
             scene=any_of(scenes),
+        # blocks of the similarity matrix are computed side by side
+        threads: 2
         resources:
             mem_mb=memory_mb("select_pairs"),
             runtime=runtime_min("select_pairs"),

@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
@@ -91,6 +92,7 @@ def similar_pairs(
     top_k: int,
     min_score: float,
     held_bytes: int = HELD_BYTES,
+    threads: int = 1,
 ) -> PairTable:
     """Every image with the ``top_k`` images that resemble it most.
 
@@ -105,6 +107,7 @@ def similar_pairs(
     top_k : most partners that an image chooses; it may be chosen by more. Ties go to the smaller row.
     min_score : least similarity, a dot product; images without features (similarity 0) are never paired.
     held_bytes : blocks are held until their descriptors take so much memory; at least one is.
+    threads : how many blocks of the matrix are computed at a time; changes nothing in the result.
     """
     found: list[Array] = []
     scores: list[Array] = []
@@ -120,17 +123,29 @@ def similar_pairs(
         }
         for column in range(len(blocks)):
             other = held[column] if column in held else read_block(column)
-            for row, own in held.items():
-                similarity = own @ other.T
-                if column == row:
-                    np.fill_diagonal(similarity, -np.inf)
-                best[row] = _largest(*best[row], blocks[column], similarity, top_k)
+            partners = (blocks[column], other, top_k)
+            with ThreadPoolExecutor(threads) as pool:
+                tasks = {
+                    row: pool.submit(_widen, best[row], own, row == column, *partners)
+                    for row, own in held.items()
+                }
+                best = {row: task.result() for row, task in tasks.items()}
         for row, (ids, similarities) in best.items():
             image, slot = np.nonzero((similarities >= min_score) & (similarities > 0))
             found.append(np.column_stack([blocks[row][image], ids[image, slot]]))
             scores.append(similarities[image, slot])
     pairs = np.concatenate(found) if found else np.zeros((0, 2))
     return PairTable.of(pairs, "retrieved", np.concatenate(scores) if scores else None)
+
+
+def _widen(
+    best: tuple[Array, Array], own: Array, same: bool, more_ids: Array, other: Array, top_k: int
+) -> tuple[Array, Array]:
+    """The best partners of a block's images, of those found before and of one more block (or its own)."""
+    similarity = own @ other.T
+    if same:
+        np.fill_diagonal(similarity, -np.inf)
+    return _largest(*best, more_ids, similarity, top_k)
 
 
 def _largest(

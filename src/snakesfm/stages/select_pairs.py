@@ -53,7 +53,7 @@ def _choose(job: StageJob, index: ImageIndex, options: "SelectPairsOptions", pai
     if "sequential" in options.method:
         table = table.union(sequential_pairs(names, options.look_ahead))
     if "retrieval" in options.method:
-        table = table.union(_retrieve(job.paths("descriptors"), options))
+        table = table.union(_retrieve(job.paths("descriptors"), options, job.threads))
     return table
 
 
@@ -72,7 +72,7 @@ def _read_list(path: str, names: list[str], refused: list[str]) -> PairTable:
     return table
 
 
-def _retrieve(paths: list[Path], options: "SelectPairsOptions") -> PairTable:
+def _retrieve(paths: list[Path], options: "SelectPairsOptions", threads: int) -> PairTable:
     image_ids = []
     for path in paths:
         with GlobalDescriptors.open(path) as file:
@@ -82,4 +82,5 @@ def _retrieve(paths: list[Path], options: "SelectPairsOptions") -> PairTable:
         lambda block: GlobalDescriptors.read(paths[block]).descriptors,
         int(options.top_k),
         options.min_score,
+        threads=threads,
     )

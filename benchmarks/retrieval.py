@@ -1,0 +1,220 @@
+"""How many of the pairs that truly overlap each choice of pairs finds, at equal numbers of pairs.
+
+    python -m benchmarks.retrieval --out DIR [--weights DIR] [--sets NAME ...] [--choices NAME ...]
+
+Two images overlap truly where the reference model shows at least 10 of its points in both, so sets whose
+reference has no points are left out. Descriptors are made by the workflow as users run it, into
+DIR/CHOICE/out/SET. DIR/retrieval.json holds what is there so far; --page writes the tables to docs/retrieval.md.
+"""
+
+import argparse
+import itertools
+import json
+import os
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.compare.measure import ROOT, CommandError, run_measured
+from benchmarks.compare.sets import ImageSet, read_sets
+from snakesfm.artifacts import GlobalDescriptors, ImageIndex
+from snakesfm.errors import SnakesfmError
+from snakesfm.evaluation.colmap_model import read_model
+from snakesfm.retrieval.pairs import natural_key
+
+Array = NDArray[Any]
+
+DATA = ROOT.parent / "shared" / "data"
+PAGE = ROOT / "docs" / "retrieval.md"
+SHARED_POINTS = 10
+# pairs per image that a choice may take
+BUDGETS = (3, 5, 10)
+# what describes the images of each choice that retrieves; the others look at nothing but names
+RETRIEVED: dict[str, tuple[str, ...]] = {
+    "vlad of sift": (),
+    "vlad of aliked": ("extract_features={method: aliked}",),
+    "vlad of xfeat": ("extract_features={method: xfeat}",),
+    "netvlad": ("describe_images={method: netvlad}",),
+    "megaloc": ("describe_images={method: megaloc}",),
+}
+# what can be measured with the weights that Python packages hold
+USUAL = ("sequential", "vlad of sift", "vlad of aliked", "vlad of xfeat")
+
+
+def overlapping_pairs(image_set: ImageSet, names: Sequence[str]) -> Array:
+    """Which pairs of images share points of the reference, (N,N) bool, upper triangle."""
+    rows = {name: row for row, name in enumerate(names)}
+    model = read_model(image_set.reference)
+    seen = np.zeros((len(names), max(len(model.points3D), 1)), np.float32)
+    columns = {number: column for column, number in enumerate(model.points3D)}
+    for image in model.images.values():
+        if image.name in rows:
+            for point in image.points2D:
+                if point.has_point3D():
+                    seen[rows[image.name], columns[point.point3D_id]] = 1
+    return np.triu(seen @ seen.T >= SHARED_POINTS, 1)
+
+
+def rank_pairs(similarities: Array) -> Array:
+    """Pairs (P,2), best first: by the better of the ranks that two images have for each other.
+
+    Ties go to the more similar. Images choose in turn, as they do in select_pairs.
+
+    Parameters
+    ----------
+    similarities : (N,N), symmetric; the diagonal is not looked at.
+    """
+    values = np.where(np.eye(len(similarities), dtype=bool), -np.inf, similarities)
+    order = np.argsort(-values, axis=1, kind="stable")
+    ranks = np.empty_like(order)
+    np.put_along_axis(ranks, order, np.arange(len(values))[None].repeat(len(values), 0), axis=1)
+    first, second = np.triu_indices(len(values), 1)
+    best = np.minimum(ranks[first, second], ranks[second, first])
+    chosen = np.lexsort((-values[first, second], best))
+    return np.column_stack([first, second])[chosen]
+
+
+def recalls(pairs: Array, overlapping: Array) -> list[float]:
+    """Percent of the overlapping pairs among the first pairs, for every budget."""
+    total = max(int(overlapping.sum()), 1)
+    hits = overlapping[pairs.min(axis=1), pairs.max(axis=1)]
+    return [100 * float(hits[: budget * len(overlapping)].sum()) / total for budget in BUDGETS]
+
+
+def measure(
+    image_set: ImageSet, choice: str, out: Path, options: Sequence[str], threads: int, limit_s: float
+) -> dict[str, Any]:
+    """Recall of one choice of pairs in one set at each budget, or why there is none."""
+    if choice == "sequential":
+        names = sorted(image_set.image_names())
+        order = np.argsort(np.array(sorted(range(len(names)), key=lambda row: natural_key(names[row]))))
+        similarities = -np.abs(order[:, None] - order[None]).astype(float)
+    else:
+        folder = out / choice.replace(" ", "_")
+        folder.mkdir(parents=True, exist_ok=True)
+        config = [f"images={image_set.images}", "output=out", f"scene={image_set.name}", *options]
+        config += ["select_pairs={method: retrieval}", *RETRIEVED[choice]]
+        command = [sys.executable, "-m", "snakemake", "--snakefile", str(ROOT / "Snakefile")]
+        command += ["--profile", str(ROOT / "profiles" / "local"), "--cores", str(threads)]
+        command += ["--until", "describe_images", "--config", *config]
+        try:
+            run_measured(command, folder, folder / f"{image_set.name}.log", limit_s)
+        except CommandError as error:
+            return {"failure": str(error)}
+        names, similarities = _similarities(folder / "out" / image_set.name)
+    overlapping = overlapping_pairs(image_set, names)
+    every = len(names) * (len(names) - 1) // 2
+    return {
+        "images": len(names),
+        "pairs": every,
+        "overlapping": int(overlapping.sum()),
+        "recalls": recalls(rank_pairs(similarities), overlapping),
+    }
+
+
+def _similarities(scene: Path) -> tuple[list[str], Array]:
+    """Names of the images, and their similarities (N,N)."""
+    names = [str(name) for name in ImageIndex.read(scene / "index_images" / "index.h5").names]
+    described: dict[int, Array] = {}
+    for path in sorted((scene / "describe_images").glob("*.h5")):
+        block = GlobalDescriptors.read(path)
+        described |= dict(zip(block.image_ids.tolist(), block.descriptors, strict=True))
+    vectors = np.stack([described[row] for row in range(len(names))])
+    return names, vectors @ vectors.T
+
+
+def render(values: Mapping[str, Mapping[str, Any]], sets: Sequence[str], choices: Sequence[str]) -> str:
+    """Markdown: a table of recall by set, choice and budget, and the mean over sets that all finished."""
+    lines = [
+        "# Retrieval",
+        "",
+        "Generated by `python -m benchmarks.retrieval --page`; do not edit.",
+        "",
+        "Percent of the truly overlapping pairs that are among the best pairs of each choice, where it may "
+        f"take {', '.join(map(str, BUDGETS))} pairs per image. Two images overlap where the reference shows "
+        f"at least {SHARED_POINTS} of its points in both. `possible` is what a choice without a wrong pair "
+        "would reach, `by chance` what pairs drawn at random do.",
+    ]
+    head = ["choice", *(f"{budget} per image" for budget in BUDGETS)]
+    for name in sets:
+        found = {one: values.get(f"{name}|{one}", {}) for one in choices}
+        known = next((value for value in found.values() if "recalls" in value), None)
+        if known is None:
+            continue
+        title = f"## {name}: {known['images']} images, "
+        title += f"{known['overlapping']} of {known['pairs']} pairs overlap"
+        lines += [
+            "",
+            title,
+            "",
+            _row(head),
+            _row(["---"] * len(head)),
+        ]
+        taken = [min(budget * known["images"], known["pairs"]) for budget in BUDGETS]
+        ceiling = [100 * min(1, count / max(known["overlapping"], 1)) for count in taken]
+        for choice, value in found.items():
+            cells = [f"{part:.1f}" for part in value.get("recalls", [])]
+            lines.append(_row([choice, *(cells or [value.get("failure", "not run"), "", ""])]))
+        lines.append(_row(["possible", *(f"{part:.1f}" for part in ceiling)]))
+        lines.append(_row(["by chance", *(f"{100 * count / known['pairs']:.1f}" for count in taken)]))
+    complete = [name for name in sets if all("recalls" in values.get(f"{name}|{c}", {}) for c in choices)]
+    if complete:
+        lines += ["", f"## Mean of {len(complete)} sets", "", _row(head), _row(["---"] * len(head))]
+        for choice in choices:
+            mean = np.mean([values[f"{name}|{choice}"]["recalls"] for name in complete], axis=0)
+            lines.append(_row([choice, *(f"{part:.1f}" for part in mean)]))
+    return "\n".join(lines) + "\n"
+
+
+def _row(cells: Sequence[str]) -> str:
+    return f"| {' | '.join(cells)} |"
+
+
+def main(arguments: list[str]) -> int:
+    """Measure what is asked for and is not there yet, and write the tables; 1 where a set is not there."""
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.retrieval",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--out", type=Path, required=True, help="folder of results and working files")
+    parser.add_argument("--weights", type=Path, default=Path("weights"), help="what fetch_weights filled")
+    parser.add_argument("--data", type=Path, default=DATA, help="folder of the image sets")
+    parser.add_argument(
+        "--sets", nargs="*", default=[], help="names of sets (all whose reference has points)"
+    )
+    parser.add_argument("--choices", nargs="*", choices=("sequential", *RETRIEVED), default=list(USUAL))
+    parser.add_argument("--options", nargs="*", default=[], help="more items for --config of every run")
+    parser.add_argument("--threads", type=int, default=os.cpu_count())
+    parser.add_argument("--limit", type=float, default=7200, help="longest time of one run in seconds")
+    parser.add_argument("--page", action="store_true", help=f"write {PAGE.relative_to(ROOT)} too")
+    given = parser.parse_args(arguments)
+    out = given.out.resolve()
+    out.mkdir(parents=True, exist_ok=True)
+    store = out / "retrieval.json"
+    values: dict[str, dict[str, Any]] = json.loads(store.read_text("utf-8")) if store.is_file() else {}
+    options = [f"weights={given.weights.resolve()}", *given.options]
+    try:
+        sets = [one for one in read_sets(given.data, given.sets) if read_model(one.reference).points3D]
+    except SnakesfmError as error:
+        sys.stderr.write(f"{error}\n")
+        return 1
+    for choice, image_set in itertools.product(given.choices, sets):
+        key = f"{image_set.name}|{choice}"
+        if "recalls" not in values.get(key, {}):
+            values[key] = measure(image_set, choice, out, options, given.threads, given.limit)
+            print(f"{key}: {values[key]}", flush=True)
+            store.write_text(json.dumps(values, indent=1, sort_keys=True) + "\n", "utf-8")
+    text = render(values, [one.name for one in sets], given.choices)
+    (out / "retrieval.md").write_text(text, "utf-8")
+    if given.page:
+        PAGE.write_text(text, "utf-8")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
