@@ -12,7 +12,7 @@ import h5py
 import yaml
 
 from benchmarks.job_logs import DONE
-from snakesfm.plan import choose_blocks
+from snakesfm.blocks import choose_blocks
 from snakesfm.simulate import Simulation, SimulationOptions
 
 ROOT = Path(__file__).resolve().parents[2]

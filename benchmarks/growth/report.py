@@ -10,7 +10,7 @@ from importlib.metadata import version
 from pathlib import Path
 
 from benchmarks.growth.measure import TILED, Measurement
-from snakesfm.plan import choose_blocks
+from snakesfm.blocks import choose_blocks
 from snakesfm.resources import NEEDS, job_load, memory_mb
 
 # last simulated stage -> numbers of images

@@ -1,8 +1,32 @@
-"""Short digests by which a job knows that a file is of the configuration that it is told."""
+"""Digests by which a file is known to be of a configuration, and inputs to be what they were."""
 
+import functools
 import hashlib
+from pathlib import Path
 
 
 def options_digest(stage_version: int, options: str) -> str:
     """A digest of a stage's version and the canonical JSON of its options: 16 hexadecimal digits."""
     return hashlib.sha256(f"{stage_version}\0{options}".encode()).hexdigest()[:16]
+
+
+@functools.cache
+def file_digest(path: str) -> str:
+    """SHA-256 of a small file, or of the cameras, images and points files of a folder; '' for no path."""
+    if not path:
+        return ""
+    root = Path(path).expanduser()
+    files = [root] if root.is_file() else sorted(p for p in root.rglob("*") if p.suffix in {".txt", ".bin"})
+    digest = hashlib.sha256()
+    for file in files:
+        digest.update(file.name.encode() + b"\0" + file.read_bytes())
+    return digest.hexdigest()
+
+
+def file_state(path: Path) -> str:
+    """Size and time of change of a file too large to be read while planning; '' where it is missing."""
+    try:
+        state = path.stat()
+    except OSError:
+        return ""
+    return f"{state.st_size} {state.st_mtime_ns}"

@@ -11,11 +11,12 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
+from snakesfm.blocks import choose_blocks, tile_names
 from snakesfm.config.base import StageOptions
 from snakesfm.config.configuration import STAGES, SceneInputs, list_scenes, load_configuration
 from snakesfm.config.match_pairs import MatchPairsOptions
 from snakesfm.config.select_pairs import SelectPairsOptions
-from snakesfm.digests import options_digest
+from snakesfm.digests import file_digest, file_state, options_digest
 from snakesfm.errors import ConfigError
 from snakesfm.front_ends import (
     DETECTOR_FREE,
@@ -28,11 +29,6 @@ from snakesfm.front_ends import (
 from snakesfm.ingest.discover import count_images, fingerprint_images
 from snakesfm.resources import Load, job_load
 
-# images up to which so many blocks are used: few steps, so that adding images rarely re-deals them, and so
-# few blocks that a tile takes about half a minute at the upper end of a step (docs/cluster.md)
-BLOCK_LADDER = ((60, 2), (1_000, 4), (4_000, 8), (16_000, 16), (60_000, 32))
-MOST_BLOCKS = 48
-
 SCENE_ARTIFACTS = (
     "index_images/index.h5",
     "calibrate_cameras/cameras.h5",
@@ -44,19 +40,6 @@ SCENE_ARTIFACTS = (
     "triangulate_tracks/points.h5",
     "adjust_bundle/reconstruction.h5",
 )
-
-
-def choose_blocks(image_count: int) -> int:
-    """The number of blocks for a number of images where the configuration says 'auto'."""
-    for most_images, blocks in BLOCK_LADDER:
-        if image_count <= most_images:
-            return blocks
-    return MOST_BLOCKS
-
-
-def tile_names(blocks: int) -> list[str]:
-    """The tiles 'a-b', a <= b, of the matrix of image pairs."""
-    return [f"{a}-{b}" for a in range(blocks) for b in range(a, blocks)]
 
 
 class ScenePlan:
@@ -211,11 +194,11 @@ class ScenePlan:
         method = self.method(stage)
         if method == "virtual_places" or (method == "virtual" and stage == "extract_features"):
             reference = str(Path(self.inputs.reference).expanduser())
-            return {"reference": reference, "source_content": _file_digest(reference)}
+            return {"reference": reference, "source_content": file_digest(reference)}
         if method == "imported":
             folder = Path(self.inputs.imported).expanduser()
             name = "features.h5" if stage == "extract_features" else "matches.h5"
-            return {"imported": str(folder), "source_content": _file_state(folder / name)}
+            return {"imported": str(folder), "source_content": file_state(folder / name)}
         return {}
 
     def weight_settings(self, stage: str, main_process: bool) -> dict[str, Any]:
@@ -296,7 +279,8 @@ class ScenePlan:
 
     def load(self, stage: str) -> Load:
         """What one job of a stage works on, on average over the blocks or tiles."""
-        return job_load(stage, self.image_count, self.blocks, self.pair_count)
+        networks = len(self.models(stage))
+        return job_load(stage, self.image_count, self.blocks, self.pair_count, networks)
 
     def final_files(self) -> list[str]:
         """What a person looks at: the scene's model, its metrics and its report."""
@@ -337,7 +321,7 @@ class ScenePlan:
             return {
                 "images": str(self.images),
                 "cameras": inputs.cameras,
-                "cameras_content": _file_digest(inputs.cameras),
+                "cameras_content": file_digest(inputs.cameras),
                 "blocks": self.blocks,
                 "content": content,
             }
@@ -359,14 +343,14 @@ class ScenePlan:
             return {
                 "blocks": self.blocks,
                 "pairs_file": self.pairs_file,
-                "pairs_content": _file_digest(self.pairs_file),
+                "pairs_content": file_digest(self.pairs_file),
             }
         if stage == "adjust_bundle":
             return {"images": str(self.images), "intrinsics": inputs.intrinsics}
         if stage == "export_model":
             return {"images": str(self.images)}
         if stage == "evaluate_model":
-            return {"reference": inputs.reference, "reference_content": _file_digest(inputs.reference)}
+            return {"reference": inputs.reference, "reference_content": file_digest(inputs.reference)}
         return {}
 
     def params(self, stage: str, wildcards: Mapping[str, str], main_process: bool) -> str:
@@ -401,30 +385,6 @@ def _check_writable(folder: Path) -> None:
         raise ConfigError(
             f"The output folder '{folder}' cannot be written: say another with --config output=DIR."
         )
-
-
-@functools.cache
-def _file_digest(path: str) -> str:
-    """SHA-256 of a small file, or of the cameras, images and points files of a folder; '' for no path."""
-    import hashlib
-
-    if not path:
-        return ""
-    root = Path(path).expanduser()
-    files = [root] if root.is_file() else sorted(p for p in root.rglob("*") if p.suffix in {".txt", ".bin"})
-    digest = hashlib.sha256()
-    for file in files:
-        digest.update(file.name.encode() + b"\0" + file.read_bytes())
-    return digest.hexdigest()
-
-
-def _file_state(path: Path) -> str:
-    """Size and time of change of a file too large to be read while planning; '' where it is missing."""
-    try:
-        state = path.stat()
-    except OSError:
-        return ""
-    return f"{state.st_size} {state.st_mtime_ns}"
 
 
 class Plan:

@@ -20,10 +20,12 @@ class Load:
     Parameters
     ----------
     images, pairs : number of images and of pairs of images.
+    networks : number of networks that are run on each.
     """
 
     images: float
     pairs: float
+    networks: int = 0
 
 
 @dataclass(frozen=True)
@@ -71,20 +73,26 @@ NEEDS = {
 }
 
 
-def job_load(stage: str, images: int, blocks: int, pairs: int) -> Load:
+# what a network takes beside, on a processor: LoFTR took 1.3 GB and 8.4 s per pair of 840 x 632
+NETWORK_MB, NETWORK_IMAGE_S, NETWORK_PAIR_S = 2600, 10.0, 17.0
+
+
+def job_load(stage: str, images: int, blocks: int, pairs: int, networks: int = 0) -> Load:
     """What one job of a stage works on, on average over the scene's blocks or tiles."""
     grain = NEEDS[stage].grain
     if grain == "block":
-        return Load(images / blocks, 0)
+        return Load(images / blocks, 0, networks)
     if grain == "tile":
-        return Load(min(2 / blocks, 1) * images, pairs / (blocks * (blocks + 1) / 2))
-    return Load(images, pairs)
+        tiles = blocks * (blocks + 1) / 2
+        return Load(min(2 / blocks, 1) * images, pairs / tiles, networks)
+    return Load(images, pairs, networks)
 
 
 def memory_mb(stage: str, load: Load, attempt: int = 1) -> int:
     """Megabytes that a stage's job asks for; each further attempt asks for twice as much."""
     need = NEEDS[stage]
     own = need.constant_mb + need.image_mb * load.images + need.pair_mb * load.pairs
+    own += NETWORK_MB * load.networks
     return 100 * math.ceil((AROUND_MB + own) / 100) << (attempt - 1)
 
 
@@ -92,4 +100,8 @@ def runtime_min(stage: str, load: Load, attempt: int = 1) -> int:
     """Minutes that a stage's job asks for; each further attempt asks for twice as much."""
     need = NEEDS[stage]
     seconds = need.image_s * load.images + need.pair_s * load.pairs
+    # a tile's network sees its pairs, a block's its images
+    seconds += load.networks * (
+        NETWORK_PAIR_S * load.pairs if load.pairs else NETWORK_IMAGE_S * load.images
+    )
     return (START_MIN + math.ceil(seconds / 60)) << (attempt - 1)

@@ -20,11 +20,11 @@ from snakesfm.artifacts.base import Header, atomic_path
 from snakesfm.artifacts.features import LocalFeatures
 from snakesfm.artifacts.images import CalibratedCameras, ImageIndex
 from snakesfm.artifacts.pairs import REJECTIONS, ImagePairs, PairMatches, TwoViewGeometries
+from snakesfm.blocks import choose_blocks, tile_names
 from snakesfm.config.configuration import options_class
 from snakesfm.errors import ConfigError, SnakesfmError
 from snakesfm.geometry.camera import Camera, cameras_to_columns
 from snakesfm.geometry.poses import translation_of
-from snakesfm.plan import choose_blocks, tile_names
 from snakesfm.seeding import block_of, derive_seed
 from snakesfm.synthetic.pairing import candidate_pairs, choose_partners, simulate_edge
 from snakesfm.synthetic.sightings import DetectorModel, DistinctLooks, match_looks, sight

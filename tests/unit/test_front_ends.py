@@ -9,10 +9,19 @@ import pytest
 from snakesfm.config.configuration import FrontEndName, options_class
 from snakesfm.errors import ConfigError
 from snakesfm.features.extraction import DETECTORS
-from snakesfm.front_ends import FRONT_ENDS, TRAINED_ON, check_methods, needed_weights
+from snakesfm.front_ends import (
+    DETECTOR_FREE,
+    FRONT_ENDS,
+    LEARNED_DESCRIPTORS,
+    TRAINED_ON,
+    check_methods,
+    needed_weights,
+)
 from snakesfm.learned.weights import WEIGHT_FILES
+from snakesfm.matching.detector_free import DETECTOR_FREE_MATCHERS
 from snakesfm.matching.matcher import MATCHERS
 from snakesfm.plan import Plan
+from snakesfm.retrieval.descriptor import DESCRIPTORS
 
 
 def plan_of(tmp_path: Path, **config: object) -> Plan:
@@ -33,7 +42,10 @@ def test_names_methods_and_registries_agree() -> None:
     assert {end.detector for end in FRONT_ENDS.values()} == allowed("extract_features")
     assert {end.matcher for end in FRONT_ENDS.values()} == allowed("match_pairs")
     assert set(DETECTORS) == allowed("extract_features") - {"virtual", "imported"}
-    assert set(MATCHERS) == allowed("match_pairs") - {"imported"}
+    assert set(MATCHERS) == allowed("match_pairs") - {"imported", *DETECTOR_FREE}
+    assert set(DETECTOR_FREE_MATCHERS) == set(DETECTOR_FREE)
+    assert set(DESCRIPTORS) == set(LEARNED_DESCRIPTORS) == allowed("describe_images") - {"vlad"}
+    assert set(LEARNED_DESCRIPTORS) <= set(WEIGHT_FILES)
 
 
 @pytest.mark.parametrize("name", FRONT_ENDS)
@@ -41,8 +53,8 @@ def test_every_front_end_fits_together_and_its_weights_are_known(name: str) -> N
     end = FRONT_ENDS[name]
     check_methods(end.detector, end.matcher)
     for stage, method in (("extract_features", end.detector), ("match_pairs", end.matcher)):
-        options = options_class(stage)(method=method)
-        assert set(needed_weights(stage, options, end.detector)) <= set(WEIGHT_FILES)
+        assert options_class(stage)(method=method).method == method
+        assert set(needed_weights(stage, method, end.detector)) <= set(WEIGHT_FILES)
 
 
 def test_the_default_needs_no_network(tmp_path: Path) -> None:
@@ -106,3 +118,52 @@ def test_virtual_and_imported_ask_for_what_they_read(tmp_path: Path) -> None:
     before = scene.params("match_pairs", {"tile": "0-0"}, True)
     (folder / "matches.h5").write_bytes(b"matches")
     assert before != scene.params("match_pairs", {"tile": "0-0"}, True)
+
+
+def test_without_keypoints_the_stages_after_matching_read_merged_ones(tmp_path: Path) -> None:
+    plan = plan_of(tmp_path, front_end="loftr", weights=str(tmp_path / "w"), device="cpu")
+    (scene,) = plan.scenes.values()
+    assert (
+        plan.models == ["loftr"] and scene.gpus("match_pairs") == 1 and scene.gpus("extract_features") == 0
+    )
+    assert scene.features_stage == "merge_keypoints" and scene.matches_stage == "index_matches"
+    assert not any("extract_features" in file for file in scene.all_files())
+    assert [Path(file).stem for file in scene.block_tiles("0")] == ["0-0", "0-1"]
+    match = json.loads(scene.params("match_pairs", {"tile": "0-0"}, True))
+    assert match["options"]["min_score"] == 0.2 and match["settings"]["device"] == "cpu"
+    (sift,) = plan_of(tmp_path).scenes.values()
+    assert sift.features_stage == "extract_features" and sift.matches_stage == "match_pairs"
+    assert not any("merge_keypoints" in file for file in sift.all_files())
+
+
+def test_networks_that_describe_images_need_no_keypoints_and_no_vocabulary(tmp_path: Path) -> None:
+    config = {"front_end": "loftr", "select_pairs": {"method": "retrieval"}}
+    for method, models in (("vlad", ["loftr"]), ("megaloc", ["loftr", "megaloc"])):
+        plan = plan_of(tmp_path, **config, describe_images={"method": method})
+        (scene,) = plan.scenes.values()
+        assert plan.models == models
+        assert scene.describes_pictures == (method == "megaloc") == (not scene.vocabulary())
+        assert scene.gpus("describe_images") == (method == "megaloc")
+        assert scene.detects_keypoints == (method == "vlad")
+    command = json.loads(scene.params("describe_images", {"block": "0"}, True))["settings"]["fetch"]
+    assert "front_end=loftr" in command and "'describe_images={method: megaloc}'" in command
+
+
+def test_one_file_of_weights_serves_one_network(tmp_path: Path) -> None:
+    file = tmp_path / "mine.ckpt"
+    file.write_bytes(b"some")
+    (scene,) = plan_of(tmp_path, front_end="loftr", weights=str(file)).scenes.values()
+    first = scene.params("match_pairs", {"tile": "0-0"}, True)
+    file.write_bytes(b"other")
+    (scene,) = plan_of(tmp_path, front_end="loftr", weights=str(file)).scenes.values()
+    assert first != scene.params("match_pairs", {"tile": "0-0"}, True)
+    with pytest.raises(ConfigError, match="needs those of 2 networks .*give a folder"):
+        plan_of(tmp_path, front_end="xfeat+lighterglue", weights=str(file))
+
+
+def test_weights_are_fetched_without_images(tmp_path: Path) -> None:
+    config = {"images": str(tmp_path / "none"), "output": str(tmp_path / "out"), "front_end": "loftr"}
+    plan = Plan(config, weights_only=True)
+    assert plan.models == ["loftr"] and not plan.scenes
+    with pytest.raises(ConfigError, match="does not exist"):
+        Plan(config)

@@ -7,8 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from snakesfm.blocks import choose_blocks, tile_names
 from snakesfm.errors import ConfigError
-from snakesfm.plan import Plan, choose_blocks, tile_names
+from snakesfm.plan import Plan
 from snakesfm.seeding import block_of, derive_seed
 
 

@@ -45,3 +45,10 @@ def test_the_page_on_clusters_names_the_needs(root: Path, stage: str) -> None:
     numbers = (need.constant_mb, need.image_mb, need.pair_mb, need.image_s, need.pair_s)
     row = f"| `{stage}` | {need.grain} | " + " | ".join(f"{number:g}" for number in numbers) + " |"
     assert row in (root / "docs" / "cluster.md").read_text()
+
+
+def test_a_network_asks_for_more() -> None:
+    for stage, pairs in (("extract_features", 0), ("match_pairs", 300)):
+        without, with_one = (job_load(stage, 40, 2, pairs, networks) for networks in (0, 1))
+        assert memory_mb(stage, with_one) == memory_mb(stage, without) + 2600
+        assert 1 < runtime_min(stage, with_one) - runtime_min(stage, without) < 60

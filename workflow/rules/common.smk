@@ -10,7 +10,8 @@ from snakemake.settings.types import DeploymentMethod
 
 from snakesfm import resources, slurm
 from snakesfm.errors import SnakesfmError
-from snakesfm.plan import Plan, tile_names
+from snakesfm.blocks import tile_names
+from snakesfm.plan import Plan
 from snakesfm.run import Run
 
 try:

@@ -4,7 +4,6 @@ import importlib
 from collections.abc import Callable
 from typing import Any, Protocol
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -46,6 +45,8 @@ def describe_image(descriptor: GlobalDescriptor, rgb: Array, longer_side_px: int
     -------
     (D,) float32 of unit length; zeros for an image of one tone, which resembles none.
     """
+    import cv2
+
     if rgb.min() == rgb.max():
         return np.zeros(descriptor.size, np.float32)
     height, width = rgb.shape[:2]

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from snakesfm.artifacts.features import GlobalDescriptors, LocalFeatures, Vocabulary
 from snakesfm.artifacts.images import ImageIndex
 from snakesfm.errors import ImageError
-from snakesfm.ingest.read import read_image
 from snakesfm.retrieval.codebook import largest_rows
 from snakesfm.retrieval.descriptor import create_descriptor, describe_image
 from snakesfm.retrieval.vlad import describe_vlad
@@ -48,6 +47,8 @@ def _describe_local_features(job: StageJob, options: "DescribeImagesOptions") ->
 
 def _describe_pictures(job: StageJob, options: "DescribeImagesOptions") -> tuple[Array, Array]:
     """The same from the images themselves; one that cannot be decoded resembles none."""
+    from snakesfm.ingest.read import read_image
+
     index = ImageIndex.read(job.paths("index")[0])
     image_ids = np.flatnonzero(index.blocks == int(job.settings["block"]))
     descriptor = create_descriptor(options.method, state=job.read_weights(options.method))

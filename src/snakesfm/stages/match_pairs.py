@@ -19,7 +19,6 @@ from snakesfm.artifacts.pairs import ImagePairs, PairCoordinates, PairMatches
 from snakesfm.errors import ImageError
 from snakesfm.features.keypoints import KeypointSet
 from snakesfm.front_ends import DETECTOR_FREE
-from snakesfm.ingest.read import read_image
 from snakesfm.matching.detector_free import (
     DetectorFreeMatcher,
     Picture,
@@ -201,6 +200,8 @@ class ImageFiles:
 
     def read(self, image: int) -> Picture:
         """One image of the index, not smaller than the matcher wants it."""
+        from snakesfm.ingest.read import read_image
+
         name, size = self._names[image], self._sizes[image]
         shorter = math.ceil(self._side_px * min(size) / max(size))
         try:

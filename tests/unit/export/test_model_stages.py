@@ -386,6 +386,8 @@ def write_former_stages(folder: Path, problem: SyntheticProblem) -> dict[str, ob
         part_ids=np.repeat(np.arange(len(problem.track_offsets) - 1), np.diff(problem.track_offsets)),
         keypoints=keypoints,
         colors=np.zeros((len(keypoints), 3), np.uint8),
+        lengths_unmerged=np.zeros(0, np.int64),
+        lengths_merged=np.zeros(0, np.int64),
     ).write(folder / "tracks.h5", HEADER)
     TriangulatedPoints(
         points=problem.points,

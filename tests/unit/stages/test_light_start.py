@@ -25,6 +25,7 @@ HEAVY = (
 )
 NEEDED = {
     "extract_features": {"cv2", "PIL"},
+    "merge_keypoints": {"cv2", "PIL"},
     "index_images": {"cv2", "pycolmap", "PIL"},
     "estimate_two_view": {"cv2", "poselib"},
     "adjust_bundle": {"cv2", "pycolmap", "poselib"},

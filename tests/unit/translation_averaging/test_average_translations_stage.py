@@ -74,6 +74,8 @@ def write_inputs(folder, truth, rotations, kinds=None, labels=None):
         part_ids=np.repeat(np.arange(len(truth.track_offsets) - 1), np.diff(truth.track_offsets)),
         keypoints=truth.track_keypoints,
         colors=np.zeros((len(truth.track_image_ids), 3), np.uint8),
+        lengths_unmerged=np.zeros(0, np.int64),
+        lengths_merged=np.zeros(0, np.int64),
     )
     inputs = {}
     for name, artifact in dict(
