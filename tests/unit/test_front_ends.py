@@ -157,7 +157,7 @@ def test_one_file_of_weights_serves_one_network(tmp_path: Path) -> None:
     file.write_bytes(b"other")
     (scene,) = plan_of(tmp_path, front_end="loftr", weights=str(file)).scenes.values()
     assert first != scene.params("match_pairs", {"tile": "0-0"}, True)
-    with pytest.raises(ConfigError, match="needs those of 2 networks .*give a folder"):
+    with pytest.raises(ConfigError, match=r"needs those of 2 networks .*give a folder"):
         plan_of(tmp_path, front_end="xfeat+lighterglue", weights=str(file))
 
 

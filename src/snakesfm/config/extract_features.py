@@ -18,6 +18,9 @@ class ExtractFeaturesOptions(StageOptions):
     max_keypoints: Annotated[int, Field(ge=16, le=100_000)] | Literal["auto"] = "auto"
     """Most keypoints kept per image, the strongest first; 'auto': 5000 of SIFT, 2048 of a network."""
 
+    surface_points: int = Field(0, ge=0, le=1_000_000)
+    """Points that 'virtual' takes from a surface through the reference's points (0: these themselves)."""
+
     max_shorter_side_px: int = Field(760, ge=64, le=20_000)
     """Shorter side to which larger images are scaled down; keypoints stay in original pixels."""
 

@@ -75,7 +75,8 @@ def _create_finder(job: StageJob, options: "ExtractFeaturesOptions") -> Detector
         from snakesfm.evaluation.colmap_model import read_model
         from snakesfm.features.virtual import VirtualKeypoints
 
-        return VirtualKeypoints(read_model(Path(job.settings["reference"])))
+        model = read_model(Path(job.settings["reference"]))
+        return VirtualKeypoints(model, options.surface_points)
     if options.method == "imported":
         return ImportedKeypoints(Path(job.settings["imported"]) / FEATURES)
     if options.method == "sift":

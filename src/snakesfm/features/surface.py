@@ -1,0 +1,82 @@
+"""Points on a surface through a model's points, and the images that see them, by open3d."""
+
+import importlib
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from snakesfm.errors import ConfigError
+
+Array = NDArray[Any]
+
+# the surface is coarse enough where so many of the points are corners of it
+LEAST_SHARE = 0.9
+
+
+class Surface:
+    """The alpha shape of points (Edelsbrunner and Muecke 1994), with points spread evenly over it.
+
+    The radius starts at the median distance of a point to its nearest neighbour and doubles until most
+    points are on the surface.
+
+    Parameters
+    ----------
+    points : (P,3) float64, at least four.
+    count : points N that are spread.
+    seed : of their places.
+
+    Raises
+    ------
+    ConfigError : open3d cannot be loaded, or the points span no surface.
+    """
+
+    def __init__(self, points: Array, count: int, seed: int) -> None:
+        self._open3d = _load_open3d()
+        vertices, triangles = self._alpha_shape(points)
+        corners = vertices[triangles]
+        cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        areas = np.linalg.norm(cross, axis=1)
+        rng = np.random.default_rng(seed)
+        self.triangle_ids = rng.choice(len(triangles), count, p=areas / areas.sum())
+        weights = rng.dirichlet((1, 1, 1), count)
+        self.points = np.einsum("nk,nkd->nd", weights, corners[self.triangle_ids])
+        self._scene = self._open3d.t.geometry.RaycastingScene(nthreads=1)
+        tensor = self._open3d.core.Tensor
+        self._scene.add_triangles(tensor(vertices.astype(np.float32)), tensor(triangles.astype(np.uint32)))
+
+    def _alpha_shape(self, points: Array) -> tuple[Array, Array]:
+        geometry, utility = self._open3d.geometry, self._open3d.utility
+        cloud = geometry.PointCloud(utility.Vector3dVector(points))
+        radius = float(np.median(np.asarray(cloud.compute_nearest_neighbor_distance())))
+        extent = float(np.linalg.norm(np.ptp(points, axis=0)))
+        with utility.VerbosityContextManager(utility.VerbosityLevel.Error):
+            whole = geometry.TetraMesh.create_from_point_cloud(cloud)
+            while 0 < radius < 2 * extent:
+                mesh = geometry.TriangleMesh.create_from_point_cloud_alpha_shape(cloud, radius, *whole)
+                triangles = np.asarray(mesh.triangles)
+                if len(np.unique(triangles)) >= LEAST_SHARE * len(points):
+                    break
+                radius *= 2
+            else:
+                raise ConfigError(
+                    "The reference model's points span no surface: say extract_features.surface_points=0."
+                )
+        return np.asarray(mesh.vertices), triangles
+
+    def seen_from(self, center: Array) -> Array:
+        """Which points (N,) bool are not hidden by the surface from a camera centre (3,)."""
+        rays = np.concatenate([np.broadcast_to(center, self.points.shape), self.points - center], axis=1)
+        hit = self._scene.cast_rays(self._open3d.core.Tensor(rays.astype(np.float32)), nthreads=1)
+        # a point is seen where the first triangle on its ray is its own
+        return np.asarray(hit["primitive_ids"].numpy() == self.triangle_ids)
+
+
+def _load_open3d() -> Any:
+    try:
+        return importlib.import_module("open3d")
+    except ImportError as error:
+        raise ConfigError(
+            f"extract_features.surface_points needs open3d, which cannot be loaded ({error}): run "
+            "'pip install -c constraints.txt .[surface]' in snakesfm's folder, or say surface_points=0."
+        ) from None
