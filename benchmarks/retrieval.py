@@ -136,8 +136,8 @@ def render(values: Mapping[str, Mapping[str, Any]], sets: Sequence[str], choices
         "",
         "Percent of the truly overlapping pairs that are among the best pairs of each choice, where it may",
         f"take {', '.join(map(str, BUDGETS))} pairs per image. Two images overlap where the reference",
-        f"shows at least {SHARED_POINTS} of its points in both. `possible` is what a choice without wrong pairs",
-        "would reach, `by chance` what pairs drawn at random do.",
+        f"shows at least {SHARED_POINTS} of its points in both. `possible` is what is reached without a",
+        "wrong pair, `by chance` what pairs drawn at random do.",
     ]
     head = ["choice", *(f"{budget} per image" for budget in BUDGETS)]
     for name in sets:

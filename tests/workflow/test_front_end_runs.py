@@ -6,10 +6,22 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+from random_weights import megaloc_state, write_netvlad
 from workflow_runner import Workflow, copy_run
 
-from snakesfm.artifacts import LocalFeatures, PairCoordinates, PairMatches, TrackTable
+from snakesfm.artifacts import (
+    GlobalDescriptors,
+    ImageIndex,
+    ImagePairs,
+    LocalFeatures,
+    PairCoordinates,
+    PairMatches,
+    TrackTable,
+)
+from snakesfm.artifacts.gather import gather_inlier_matches
+from snakesfm.artifacts.hloc import read_hloc_matches
 from snakesfm.evaluation.colmap_model import read_model
+from snakesfm.learned.weights import WEIGHT_FILES
 
 pytestmark = pytest.mark.workflow
 DEGREES = ("1", "2.5", "5", "10", "20")
@@ -60,6 +72,31 @@ def test_hlocs_files_go_out_and_come_in_again(finished, small_scene: Path, workf
     assert read_model(again.folder / "out" / "square" / "export_model").num_reg_images() == 16
 
 
+def test_hlocs_files_hold_the_inliers_and_give_them_back(
+    finished, small_scene: Path, workflow: Workflow
+) -> None:
+    copy_run(finished[0], workflow.folder)
+    config = [f"images={small_scene / 'images'}", f"reference={small_scene / 'reference'}", "output=out"]
+    outcome = workflow.run("hloc", "--config", *config)
+    assert outcome.status == 0, outcome.text
+    folder = workflow.folder / "out" / "square" / "export_hloc"
+    names = [str(name) for name in ImageIndex.read(finished[0] / "index_images" / "index.h5").names]
+    pairs, offsets, inliers = gather_inlier_matches(
+        sorted((finished[0] / "estimate_two_view").glob("*.h5"))
+    )
+    listed = [tuple(line.split()) for line in (folder / "pairs.txt").read_text().splitlines()]
+    assert listed == [(names[i], names[j]) for i, j in pairs.tolist()] and len(listed) > 50
+    with h5py.File(folder / "features.h5") as features, h5py.File(folder / "matches.h5") as file:
+        for row, pair in enumerate(listed):
+            counts = tuple(len(features[name]["keypoints"]) for name in pair)
+            expected = inliers[offsets[row] : offsets[row + 1]]
+            matches, scores = read_hloc_matches(file, pair, counts)
+            np.testing.assert_array_equal(matches, expected[np.argsort(expected[:, 0])])
+            turned, _ = read_hloc_matches(file, pair[::-1], counts[::-1])
+            np.testing.assert_array_equal(turned[np.argsort(turned[:, 1]), ::-1], matches)
+            assert (scores > 0).all() and (scores <= 1).all()
+
+
 def test_missing_weights_end_the_run_with_one_sentence(small_scene: Path, workflow: Workflow) -> None:
     pytest.importorskip("torch", reason="the extra 'deep' is not installed")
     outcome = workflow.run(
@@ -74,18 +111,22 @@ def test_missing_weights_end_the_run_with_one_sentence(small_scene: Path, workfl
 def test_the_weights_are_fetched_by_their_own_target(
     small_scene: Path, workflow: Workflow, weights: Path
 ) -> None:
-    config = [f"images={small_scene / 'images'}", "output=out", "front_end=xfeat+lighterglue"]
-    outcome = workflow.run("fetch_weights", "--config", *config)
+    # neither images nor an output folder are needed
+    outcome = workflow.run("fetch_weights", "--config", "images=nowhere", "front_end=xfeat+lighterglue")
     assert outcome.status == 0, outcome.text
+    assert "no model yet" not in outcome.text
+    assert sorted(path.name for path in workflow.folder.iterdir()) == [".snakemake", "weights"]
     names = sorted(path.name for path in (workflow.folder / "weights").iterdir())
     assert names == ["SHA256SUMS", "xfeat-lighterglue.pt", "xfeat.pt"]
     for name in names[1:]:
         assert (workflow.folder / "weights" / name).read_bytes() == (weights / name).read_bytes()
 
 
-def test_superpoint_and_superglue_run_through_with_random_weights(
-    small_scene: Path, workflow: Workflow
+@pytest.mark.parametrize("method", ["superglue", "lightglue"])
+def test_superpoint_and_its_matchers_run_through_with_random_weights(
+    small_scene: Path, workflow: Workflow, method: str
 ) -> None:
+    torch = pytest.importorskip("torch", reason="the extra 'deep' is not installed")
     pytest.importorskip("transformers", reason="the extra 'deep' is not installed")
     from safetensors.torch import save_file
 
@@ -96,17 +137,21 @@ def test_superpoint_and_superglue_run_through_with_random_weights(
     folder.mkdir()
     networks = {
         "superpoint": create_detector("superpoint", state=None),
-        "superglue_outdoor": create_matcher("superglue", detector="superpoint", min_score=0.0, state=None),
+        f"superpoint_{method}": create_matcher(method, detector="superpoint", min_score=0.0, state=None),
     }
-    for name, made in networks.items():
-        save_file(made._network.state_dict(), folder / f"{name}.safetensors")
+    for model, made in networks.items():
+        path = folder / WEIGHT_FILES[model].name
+        if path.suffix == ".safetensors":
+            save_file(made._network.state_dict(), path)
+        else:
+            torch.save(made._network.state_dict(), path)
     outcome = workflow.run(
         "--until",
         "match_pairs",
         "--config",
         f"images={small_scene / 'images'}",
         "output=out",
-        "front_end=superpoint+superglue",
+        f"front_end=superpoint+{method}",
         "extract_features={max_keypoints: 64}",
         "select_pairs={method: sequential, look_ahead: 1}",
         "match_pairs={min_score: 0.0}",
@@ -204,3 +249,30 @@ def test_loftr_runs_through_with_random_weights(small_scene: Path, workflow: Wor
     for coordinates, tile in zip(found, tiles, strict=True):
         np.testing.assert_array_equal(coordinates.pairs, tile.pairs)
         assert (np.diff(tile.offsets) <= np.diff(coordinates.offsets)).all()
+
+
+@pytest.mark.parametrize("method", ["netvlad", "megaloc"])
+def test_images_are_described_by_networks_with_random_weights(
+    small_scene: Path, workflow: Workflow, method: str
+) -> None:
+    torch = pytest.importorskip("torch", reason="the extra 'deep' is not installed")
+    pytest.importorskip("transformers", reason="the extra 'deep' is not installed")
+    (workflow.folder / "weights").mkdir()
+    path = workflow.folder / "weights" / WEIGHT_FILES[method].name
+    if method == "netvlad":
+        write_netvlad(path)
+    else:
+        torch.save(megaloc_state(), path)
+    config = ["select_pairs={method: retrieval, top_k: 2}", f"describe_images={{method: {method}}}"]
+    config += [f"images={small_scene / 'images'}", "output=out"]
+    outcome = workflow.run("--until", "select_pairs", "--config", *config)
+    assert outcome.status == 0, outcome.text
+    # no keypoints and no vocabulary are needed to choose pairs
+    assert set(outcome.rules) == {"index_images", "describe_images", "select_pairs"}
+    out = workflow.folder / "out" / "square"
+    blocks = [GlobalDescriptors.read(path) for path in sorted((out / "describe_images").glob("*.h5"))]
+    assert sum(len(block.image_ids) for block in blocks) == 16
+    for block in blocks:
+        np.testing.assert_allclose(np.linalg.norm(block.descriptors, axis=1), 1, atol=1e-5)
+    tiles = [ImagePairs.read(path) for path in sorted((out / "select_pairs").glob("*.h5"))]
+    assert 16 <= sum(len(tile.pairs) for tile in tiles) <= 32

@@ -10,15 +10,12 @@ from snakesfm.errors import ConfigError
 
 Array = NDArray[Any]
 
-# the surface is coarse enough where so many of the points are corners of it
-LEAST_SHARE = 0.9
-
 
 class Surface:
     """The alpha shape of points (Edelsbrunner and Muecke 1994), with points spread evenly over it.
 
-    The radius starts at the median distance of a point to its nearest neighbour and doubles until most
-    points are on the surface.
+    Of the radii from the median distance of a point to its nearest neighbour upwards, each twice the former,
+    the one is taken that has most points on the surface.
 
     Parameters
     ----------
@@ -50,19 +47,20 @@ class Surface:
         cloud = geometry.PointCloud(utility.Vector3dVector(points))
         radius = float(np.median(np.asarray(cloud.compute_nearest_neighbor_distance())))
         extent = float(np.linalg.norm(np.ptp(points, axis=0)))
+        most, best = 0, None
         with utility.VerbosityContextManager(utility.VerbosityLevel.Error):
             whole = geometry.TetraMesh.create_from_point_cloud(cloud)
             while 0 < radius < 2 * extent:
                 mesh = geometry.TriangleMesh.create_from_point_cloud_alpha_shape(cloud, radius, *whole)
-                triangles = np.asarray(mesh.triangles)
-                if len(np.unique(triangles)) >= LEAST_SHARE * len(points):
-                    break
+                corners = len(np.unique(np.asarray(mesh.triangles)))
+                if corners > most:
+                    most, best = corners, mesh
                 radius *= 2
-            else:
-                raise ConfigError(
-                    "The reference model's points span no surface: say extract_features.surface_points=0."
-                )
-        return np.asarray(mesh.vertices), triangles
+        if best is None:
+            raise ConfigError(
+                "The reference model's points span no surface: say extract_features.surface_points=0."
+            )
+        return np.asarray(best.vertices), np.asarray(best.triangles)
 
     def seen_from(self, center: Array) -> Array:
         """Which points (N,) bool are not hidden by the surface from a camera centre (3,)."""
