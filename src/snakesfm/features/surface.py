@@ -14,7 +14,7 @@ Array = NDArray[Any]
 class Surface:
     """The alpha shape of points (Edelsbrunner and Muecke 1994), with points spread evenly over it.
 
-    Of the radii from the median distance of a point to its nearest neighbour upwards, each twice the former,
+    Of the radii from the median distance of a point to its nearest neighbour upwards, each twice the last,
     the one is taken that has most points on the surface.
 
     Parameters
