@@ -5,14 +5,18 @@ from typing import TYPE_CHECKING, Any
 
 import h5py
 import numpy as np
+from numpy.typing import NDArray
 
 from snakesfm.artifacts import ImageIndex, LocalFeatures, PairMatches, TwoViewGeometries, atomic_path
 from snakesfm.artifacts.hloc import clashing_names, write_hloc_features, write_hloc_matches
 from snakesfm.errors import ConfigError
 from snakesfm.stages.job import StageJob
+from snakesfm.two_view.correspondences import first_rows_at_place
 
 if TYPE_CHECKING:
     from snakesfm.config.export_hloc import ExportHlocOptions
+
+Array = NDArray[Any]
 
 COLUMNS = ("keypoints", "descriptors", "scores", "scales", "angles")
 
@@ -30,34 +34,39 @@ def run(job: StageJob) -> None:
             f"hloc's files cannot tell the images '{clash[0]}' and '{clash[1]}' apart: rename one of them."
         )
     features, matches, pairs = job.outputs
-    counts: dict[int, int] = {}
+    places: dict[int, Array] = {}
     with atomic_path(features) as temporary, h5py.File(temporary, "w", libver="latest") as file:
         for path in job.paths("features"):
-            counts |= _write_block(file, path, names)
+            places |= _write_block(file, path, names)
     written: list[tuple[int, int]] = []
     with atomic_path(matches) as temporary, h5py.File(temporary, "w", libver="latest") as file:
         for putative, verified in zip(job.paths("matches"), job.paths("geometries"), strict=True):
-            written += _write_tile(file, putative, verified, names, counts, options.matches)
+            written += _write_tile(file, putative, verified, names, places, options.matches)
     with atomic_path(pairs) as temporary:
         temporary.write_text("".join(f"{names[i]} {names[j]}\n" for i, j in sorted(written)), "utf-8")
-    print(f"{len(counts)} images, {len(written)} pairs with {options.matches} matches")
+    print(f"{len(places)} images, {len(written)} pairs with {options.matches} matches")
 
 
-def _write_block(file: h5py.File, path: Path, names: list[str]) -> dict[int, int]:
-    """Features of one block's images; how many keypoints each has."""
+def _write_block(file: h5py.File, path: Path, names: list[str]) -> dict[int, Array]:
+    """Features of one block's images; by image the first keypoint (N,) int32 at each keypoint's place."""
     block = LocalFeatures.read(path)
-    counts = {}
+    places = {}
     for row, image in enumerate(block.image_ids.tolist()):
         part = slice(block.offsets[row], block.offsets[row + 1])
         columns = {name: getattr(block, name)[part] for name in COLUMNS}
         width, height = block.sizes[row].tolist()
         write_hloc_features(file, names[image], columns, (width, height))
-        counts[image] = len(columns["keypoints"])
-    return counts
+        places[image] = first_rows_at_place(columns["keypoints"]).astype(np.int32)
+    return places
 
 
 def _write_tile(
-    file: h5py.File, putative: Path, verified: Path, names: list[str], counts: dict[int, int], which: str
+    file: h5py.File,
+    putative: Path,
+    verified: Path,
+    names: list[str],
+    places: dict[int, Array],
+    which: str,
 ) -> list[tuple[int, int]]:
     """Matches of one tile's pairs; the pairs that have some."""
     tile, geometries = PairMatches.read(putative), TwoViewGeometries.read(verified)
@@ -66,18 +75,22 @@ def _write_tile(
         part = slice(tile.offsets[row], tile.offsets[row + 1])
         matches, scores = tile.matches[part], tile.scores[part]
         if which == "inliers":
-            kept = _rows_of(geometries, row, matches)
-            matches, scores = matches[kept], scores[kept]
+            found = np.column_stack([places[i][matches[:, 0]], places[j][matches[:, 1]]])
+            matches, scores = _inliers(geometries, row, found, scores)
         if len(matches):
-            write_hloc_matches(file, (names[i], names[j]), matches, scores, counts[i])
+            write_hloc_matches(file, (names[i], names[j]), matches, scores, len(places[i]))
             written.append((i, j))
     return written
 
 
-def _rows_of(geometries: TwoViewGeometries, row: int, matches: Any) -> Any:
-    """Which matches (M,2) of a pair are inliers of its accepted pose, (M,) bool."""
+def _inliers(geometries: TwoViewGeometries, row: int, matches: Array, scores: Array) -> tuple[Array, Array]:
+    """Inliers (K,2) of a pair's accepted pose, and of each the best score (K,) of a match at its places."""
     if geometries.rejections[row] != 0:
-        return np.zeros(len(matches), bool)
+        return np.zeros((0, 2), np.int32), np.zeros(0, np.float32)
     inliers = geometries.inliers[geometries.offsets[row] : geometries.offsets[row + 1]]
-    # a row of the first image is matched once at most, so it tells the match
-    return np.isin(matches[:, 0], inliers[:, 0])
+    # inliers are counted by the first keypoint at a place, so that each place is there once
+    best: dict[tuple[int, int], float] = {}
+    for (first, second), score in zip(matches.tolist(), scores.tolist(), strict=True):
+        best[first, second] = max(score, best.get((first, second), 0.0))
+    kept = [best[first, second] for first, second in inliers.tolist()]
+    return inliers, np.array(kept, np.float32)
