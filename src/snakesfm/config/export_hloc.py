@@ -1,12 +1,14 @@
 """Options of export_hloc."""
 
-from typing import Literal
+from typing import ClassVar, Literal
 
 from snakesfm.config.base import StageOptions
 
 
 class ExportHlocOptions(StageOptions):
     """Features and matches as hloc's files; made only by the target `hloc`."""
+
+    stage_version: ClassVar[int] = 2
 
     matches: Literal["inliers", "putative"] = "inliers"
     """Which matches are written: those that fit the pair's relative pose, or all that were found."""

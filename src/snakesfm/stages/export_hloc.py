@@ -11,7 +11,6 @@ from snakesfm.artifacts import ImageIndex, LocalFeatures, PairMatches, TwoViewGe
 from snakesfm.artifacts.hloc import clashing_names, write_hloc_features, write_hloc_matches
 from snakesfm.errors import ConfigError
 from snakesfm.stages.job import StageJob
-from snakesfm.two_view.correspondences import first_rows_at_place
 
 if TYPE_CHECKING:
     from snakesfm.config.export_hloc import ExportHlocOptions
@@ -49,6 +48,9 @@ def run(job: StageJob) -> None:
 
 def _write_block(file: h5py.File, path: Path, names: list[str]) -> dict[int, Array]:
     """Features of one block's images; by image the first keypoint (N,) int32 at each keypoint's place."""
+    # brings OpenCV along, which a stage's import must not
+    from snakesfm.two_view.correspondences import first_rows_at_place
+
     block = LocalFeatures.read(path)
     places = {}
     for row, image in enumerate(block.image_ids.tolist()):
