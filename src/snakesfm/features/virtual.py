@@ -12,6 +12,9 @@ from snakesfm.geometry.colmap_binding import pycolmap
 
 Array = NDArray[Any]
 
+# of a ray's x and y at depth 1: far above rounding and far below a pixel
+RAY_TOLERANCE = 1e-5
+
 
 class VirtualKeypoints:
     """Where the points of a known model project in its images: an oracle without noise or false matches.
@@ -64,6 +67,10 @@ class VirtualKeypoints:
         places = np.full((len(ids), 2), -1.0)
         places[ahead] = camera.img_from_cam(local[ahead]) * scale
         inside = ahead & (places > 0).all(axis=1) & (places < size).all(axis=1)
+        # distortion folds rays from far outside into the image: their pixels belong to other rays
+        rays = camera.cam_from_img(places[inside] / scale)
+        same = np.abs(rays - local[inside, :2] / local[inside, 2:]).max(axis=1, initial=0) < RAY_TOLERANCE
+        inside[inside] = same
         count = int(inside.sum())
         return KeypointSet(
             places[inside].astype(np.float32),

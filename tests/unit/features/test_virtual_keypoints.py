@@ -5,6 +5,7 @@ import pycolmap
 import pytest
 
 from snakesfm.errors import ConfigError
+from snakesfm.evaluation.colmap_model import read_model
 from snakesfm.features.keypoints import KeypointSource
 from snakesfm.features.virtual import VirtualKeypoints
 from snakesfm.matching.matcher import create_matcher
@@ -59,3 +60,14 @@ def test_the_matcher_pairs_the_same_points_and_no_others(model):
 def test_a_model_without_points_is_refused():
     with pytest.raises(ConfigError, match="has no points"):
         VirtualKeypoints(pycolmap.Reconstruction())
+
+
+def test_points_that_distortion_folds_into_the_image_are_not_seen(tmp_path):
+    # at the lens's edge, x = 1.6 at depth 1, the model of distortion turns round: 1.6 (1 - 0.5 * 1.6^2) = -0.45
+    (tmp_path / "cameras.txt").write_text("1 SIMPLE_RADIAL 1000 800 500 500 400 -0.5\n")
+    (tmp_path / "images.txt").write_text("1 1 0 0 0 0 0 0 1 a.jpg\n600 400 1 275 400 2\n")
+    (tmp_path / "points3D.txt").write_text(
+        "1 0.2 0 1 9 9 9 0 1 0\n2 1.6 0 1 9 9 9 0 1 1\n",
+    )
+    found = VirtualKeypoints(read_model(tmp_path)).read("a.jpg", (1000, 800))
+    np.testing.assert_allclose(found.keypoints, [[500 + 500 * 0.2 * (1 - 0.5 * 0.04), 400]], atol=1e-3)
