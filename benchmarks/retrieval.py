@@ -41,8 +41,8 @@ RETRIEVED: dict[str, tuple[str, ...]] = {
     "netvlad": ("describe_images={method: netvlad}",),
     "megaloc": ("describe_images={method: megaloc}",),
 }
-# what can be measured with the weights that Python packages hold
-USUAL = ("sequential", "vlad of sift", "vlad of aliked", "vlad of xfeat")
+# what can be measured in minutes with the weights that Python packages hold
+USUAL = ("sequential", "vlad of sift", "vlad of xfeat")
 
 
 def overlapping_pairs(image_set: ImageSet, names: Sequence[str]) -> Array:
