@@ -6,9 +6,11 @@ localrules:
 
 
 rule fetch_weights:
+    log:
+        ".snakemake/log/fetch_weights.log",
     params:
         python=sys.executable,
         folder=str(PLAN.weights),
         models=PLAN.models,
     shell:
-        "{params.python:q} -m snakesfm.learned.fetch {params.folder:q} {params.models:q}"
+        "{params.python:q} -m snakesfm.learned.fetch {params.folder:q} {params.models:q} 2>&1 | tee {log:q}"
