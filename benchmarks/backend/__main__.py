@@ -3,35 +3,42 @@
     python -m benchmarks.backend [--sizes 50 300 1000] [--outliers 0 0.1 0.2 0.3 0.4] [--seeds 3]
 
 Needs ViewGraphForge (``pip install -e '.[bench]'``). Every method runs in a process of its own with limits
-on time and memory, so one that fails is one row.
+on time and memory, so one that fails is one row. With ``--positions``, cameras are positioned as well, with
+the rotations of each of ``--methods``. ``--add`` keeps the rows of an earlier command on the page.
 """
 
 import argparse
 import csv
-import importlib.metadata
-import multiprocessing
-import os
-import platform
-import resource
+import shlex
 import sys
-import time
-from collections import defaultdict
 from collections.abc import Iterator
-from datetime import date
+from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from benchmarks.backend.measures import rotation_errors_deg
+from benchmarks.backend.apart import Outcome, import_libraries, run_apart
+from benchmarks.backend.measures import position_errors_percent, rotation_errors_deg
 from benchmarks.backend.methods import METHODS
-from benchmarks.backend.problems import FAMILIES, SYMMETRIC_CASES, Problem, forge, read_real, synthesize
+from benchmarks.backend.positions import POSITIONS, pose_positioning
+from benchmarks.backend.problems import (
+    FAMILIES,
+    LAYOUTS,
+    SYMMETRIC_CASES,
+    Problem,
+    forge,
+    lay_out,
+    read_real,
+    synthesize,
+)
+from benchmarks.backend.report import Row, render
 
 COLUMNS = (
-    "problem", "cameras", "edges", "outliers", "coherent", "seed", "method",
-    "images", "mean_deg", "median_deg", "p90_deg", "cpu_s", "peak_mib", "failure",
+    "problem", "cameras", "edges", "outliers", "coherent", "seed", "method", "positions",
+    "images", "mean_deg", "median_deg", "p90_deg", "mean_percent", "median_percent", "p90_percent",
+    "cpu_s", "peak_mib", "failure", "command",
 )  # fmt: skip
-MEMORY_BYTES = 8 << 30
 REAL = ("strecha_castle_p30", "middlebury_temple_ring", "statue_of_liberty_135",
         "sevenscenes_redkitchen_200", "seneca_aerial_167")  # fmt: skip
 
@@ -43,24 +50,35 @@ def main() -> int:
     parser.add_argument("--outliers", type=float, nargs="*", default=[0.0, 0.1, 0.2, 0.3, 0.4])
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--families", nargs="*", default=list(FAMILIES))
-    parser.add_argument("--sources", nargs="*", default=["forge", "coherent", "colmap", "real"])
+    parser.add_argument(
+        "--sources", nargs="*", default=["forge", "coherent", "layouts", "colmap", "real"]
+    )
     parser.add_argument("--methods", nargs="*", default=list(METHODS))
+    parser.add_argument("--positions", nargs="*", default=[], choices=POSITIONS, help="how to position")
     parser.add_argument("--timeout", type=float, default=300.0, help="seconds per method and problem")
     parser.add_argument("--real", type=Path, default=Path("../shared/data/viewgraph_real"))
     parser.add_argument("--csv", type=Path, default=Path("benchmarks_backend.csv"))
     parser.add_argument("--table", type=Path, default=Path("docs/benchmarks_backend.md"))
+    parser.add_argument("--add", action="store_true", help="keep the rows that the CSV file has")
     arguments = parser.parse_args()
-    rows = []
+    command = shlex.join(["python", "-m", "benchmarks.backend", *sys.argv[1:]])
+    import_libraries()
+    rows: list[Row] = []
+    if arguments.add and arguments.csv.exists():
+        with arguments.csv.open(newline="") as file:
+            rows = list(csv.DictReader(file))
     with arguments.csv.open("w", newline="") as file:
         writer = csv.DictWriter(file, COLUMNS)
         writer.writeheader()
+        writer.writerows(rows)
         for problem in problems(arguments):
             for method in arguments.methods:
-                rows.append(measure(problem, method, arguments.timeout))
-                writer.writerow(rows[-1])
-                file.flush()
-                print(" ".join(str(rows[-1][column]) for column in COLUMNS), flush=True)
-    arguments.table.write_text(render(rows, " ".join(sys.argv[1:])))
+                for row in measure(problem, method, arguments.positions, arguments.timeout):
+                    rows.append(row | {"command": command})
+                    writer.writerow(rows[-1])
+                    file.flush()
+                    print(" ".join(row[column] for column in COLUMNS[:-1]), flush=True)
+    arguments.table.write_text(render(rows))
     return 0
 
 
@@ -78,115 +96,57 @@ def problems(arguments: argparse.Namespace) -> Iterator[Problem]:
                         yield forge(family, cameras, outliers, False, seed)
                     if "coherent" in arguments.sources and family in SYMMETRIC_CASES:
                         yield forge(family, cameras, outliers, True, seed)
+                if "layouts" in arguments.sources:
+                    for layout in LAYOUTS:
+                        yield lay_out(layout, cameras, outliers, seed)
                 if "colmap" in arguments.sources and cameras <= 300:
                     yield synthesize(cameras, outliers, seed)
 
 
-def measure(problem: Problem, method: str, timeout_s: float) -> dict[str, Any]:
-    """One row: the method in a child process."""
-    row: dict[str, Any] = dict.fromkeys(COLUMNS, "")
-    row |= {
+def measure(problem: Problem, method: str, positions: list[str], timeout_s: float) -> Iterator[Row]:
+    """A row of the rotations by ``method``, and one of each way to position with them."""
+    averaged = run_apart(partial(METHODS[method], problem), timeout_s)
+    turned = np.zeros(0) if averaged.failure else rotation_errors_deg(averaged.value, problem.truth)
+    errors = {"deg": turned}
+    yield describe(problem, averaged, errors) | {"method": method}
+    if not len(turned) or not len(problem.rays):
+        return
+    ready = pose_positioning(problem, averaged.value)
+    for name in positions:
+        placed = run_apart(partial(POSITIONS[name], ready, problem.seed), timeout_s)
+        off = np.zeros(0)
+        if not placed.failure:
+            off = position_errors_percent(averaged.value, placed.value, problem.truth, problem.centers)
+        yield describe(problem, placed, errors | {"percent": off}) | {"method": method, "positions": name}
+
+
+def describe(problem: Problem, outcome: Outcome, errors: dict[str, NDArray[np.float64]]) -> Row:
+    """A row of all but the method; ``errors`` (K,) by unit, of which the last says how many images."""
+    row = dict.fromkeys(COLUMNS, "") | {
         "problem": problem.name,
-        "cameras": problem.cameras,
-        "edges": len(problem.pairs),
-        "outliers": problem.outliers,
-        "coherent": int(problem.coherent),
-        "seed": problem.seed,
-        "method": method,
+        "cameras": str(problem.cameras),
+        "edges": str(len(problem.pairs)),
+        "outliers": str(problem.outliers),
+        "coherent": str(int(problem.coherent)),
+        "seed": str(problem.seed),
+        "failure": outcome.failure,
     }
-    context = multiprocessing.get_context("fork")
-    receiving, sending = context.Pipe(duplex=False)
-    child = context.Process(target=_run, args=(problem, method, sending))
-    child.start()
-    sending.close()
-    if receiving.poll(timeout_s):
-        try:
-            row |= receiving.recv()
-        except EOFError:
-            child.join()
-            row["failure"] = f"ended with exit code {child.exitcode}"
-    else:
-        row["failure"] = f"not done in {timeout_s:.0f} s"
-        child.kill()
-    child.join()
-    return row
-
-
-def _run(problem: Problem, method: str, sending: Any) -> None:
-    resource.setrlimit(resource.RLIMIT_AS, (MEMORY_BYTES, MEMORY_BYTES))
-    start = time.process_time()
-    try:
-        averaged = METHODS[method](problem)
-    except Exception as fault:
-        sending.send({"failure": f"{type(fault).__name__}: {fault}"[:200]})
-        return
-    seconds = time.process_time() - start
-    errors = rotation_errors_deg(averaged, problem.truth)
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    if len(errors) == 0:
-        sending.send({"images": 0, "failure": "no image has a rotation"})
-        return
-    sending.send(
-        {
-            "images": len(errors),
-            "mean_deg": f"{errors.mean():.4f}",
-            "median_deg": f"{np.median(errors):.4f}",
-            "p90_deg": f"{np.percentile(errors, 90):.4f}",
-            "cpu_s": f"{seconds:.2f}",
-            "peak_mib": f"{peak:.0f}",
+    if outcome.failure:
+        return row
+    images = len(list(errors.values())[-1])
+    if images == 0:
+        return row | {"images": "0", "failure": "no image has a result"}
+    for unit, values in errors.items():
+        row |= {
+            f"mean_{unit}": f"{values.mean():.4f}",
+            f"median_{unit}": f"{np.median(values):.4f}",
+            f"p90_{unit}": f"{np.percentile(values, 90):.4f}",
         }
-    )
-
-
-def render(rows: list[dict[str, Any]], command: str) -> str:
-    """Markdown: median over seeds and, in brackets, its spread, of mean and median rotation error."""
-    versions = ", ".join(
-        f"{name} {importlib.metadata.version(name)}" for name in ("snakesfm", "pycolmap", "gtsam", "numpy")
-    )
-    lines = [
-        "# The back-end on view graphs with known truth",
-        "",
-        f"{date.today().isoformat()}, {os.cpu_count()} cores, {platform.machine()}, Python"
-        f" {platform.python_version()}, {versions}. Made by `python -m benchmarks.backend {command}`.",
-        "",
-        "Rotation errors in degrees after alignment by the median rotation: median over seeds of the mean"
-        " error (smallest to largest), and of the median error. *Ratio* is to COLMAP's default on the same"
-        " problems. *Oracle* is weighted least squares on the right edges alone, started at the truth."
-        " Seconds are of the processor.",
-        "",
-        "| problem | cameras | outliers | coherent | method | images"
-        " | mean | ratio | median | ratio | s | MiB |",
-        "|---|---|---|---|---|---|---|---|---|---|---|---|",
-    ]
-    groups: dict[tuple[Any, ...], list[dict[str, Any]]] = defaultdict(list)
-    for row in rows:
-        groups[tuple(row[key] for key in ("problem", "cameras", "outliers", "coherent", "method"))].append(
-            row
-        )
-    for key, group in groups.items():
-        name, cameras, outliers, coherent, method = key
-        done = [row for row in group if not row["failure"]]
-        head = f"| {name} | {cameras} | {outliers:.0%} | {'yes' if coherent else 'no'} | {method} |"
-        if not done:
-            lines.append(f"{head} {group[0]['failure']} | | | | | | |")
-            continue
-        means, medians = ([float(row[column]) for row in done] for column in ("mean_deg", "median_deg"))
-        base = [row for row in groups.get((*key[:4], "colmap"), []) if not row["failure"]]
-        ratios = [
-            f"{np.median(values) / np.median([float(row[column]) for row in base]):.2f}" if base else ""
-            for values, column in ((means, "mean_deg"), (medians, "median_deg"))
-        ]
-        cells = [
-            f"{np.median([row['images'] for row in done]):.0f}",
-            f"{np.median(means):.3f} ({min(means):.3f} to {max(means):.3f})",
-            ratios[0],
-            f"{np.median(medians):.3f}",
-            ratios[1],
-            f"{np.median([float(row['cpu_s']) for row in done]):.1f}",
-            f"{max(float(row['peak_mib']) for row in done):.0f}",
-        ]
-        lines.append(f"{head} {' | '.join(cells)} |")
-    return "\n".join(lines) + "\n"
+    return row | {
+        "images": str(images),
+        "cpu_s": f"{outcome.cpu_s:.2f}",
+        "peak_mib": f"{outcome.peak_mib:.0f}",
+    }
 
 
 if __name__ == "__main__":

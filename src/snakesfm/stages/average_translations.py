@@ -18,7 +18,12 @@ from snakesfm.translation_averaging.averagers import (
     TranslationAverager,
     TranslationRecovery,
 )
-from snakesfm.translation_averaging.problem import PositioningProblem, edge_directions, world_rays
+from snakesfm.translation_averaging.problem import (
+    PositioningProblem,
+    direction_sigmas,
+    edge_directions,
+    world_rays,
+)
 from snakesfm.translation_averaging.support import SupportLimits
 
 if TYPE_CHECKING:
@@ -64,7 +69,7 @@ def run(job: StageJob) -> None:
         image_count=len(index.names),
         pairs=pairs,
         directions=edge_directions(rotations, pairs, graph.translations[usable]),
-        sigmas_rad=_direction_sigmas(graph.covariances[usable]),
+        sigmas_rad=direction_sigmas(graph.covariances[usable]),
         ray_images=images,
         ray_tracks=tracks.part_ids[by_part][rows].astype(np.int64),
         rays=world_rays(rotations, images, normalized[rows]),
@@ -122,13 +127,6 @@ def _averager(options: "AverageTranslationsOptions") -> TranslationAverager:
             options.rays_per_camera, options.positioning_loss_scale, options.positioning_start
         )
     return ScaleChain(options.rays_per_camera, float(np.radians(options.ray_sigma_deg)))
-
-
-def _direction_sigmas(covariances: Array) -> Array:
-    """Standard deviations (E) in radians of the translations' directions; 5 degrees where unknown."""
-    variances = (covariances[:, 3, 3] + covariances[:, 4, 4]) / 2.0
-    known = np.isfinite(variances) & (variances > 0)
-    return np.where(known, np.sqrt(np.where(known, variances, 1.0)), np.radians(5.0))
 
 
 def _median(values: Array) -> float:

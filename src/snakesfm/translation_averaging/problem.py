@@ -78,3 +78,15 @@ def world_rays(rotations: Array, image_ids: Array, normalized: Array) -> Array:
     rays = np.concatenate([normalized, np.ones((len(normalized), 1))], axis=1)
     rays = np.einsum("qji,qj->qi", rotations[image_ids], rays)
     return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))
+
+
+def direction_sigmas(covariances: Array) -> Array:
+    """Standard deviations (E) in radians of the translations' directions; 5 degrees where unknown.
+
+    Parameters
+    ----------
+    covariances : (E,5,5) rad^2, rows 3 and 4 of the direction's tangents; NaN where unknown.
+    """
+    variances = (covariances[:, 3, 3] + covariances[:, 4, 4]) / 2.0
+    known = np.isfinite(variances) & (variances > 0)
+    return np.where(known, np.sqrt(np.where(known, variances, 1.0)), np.radians(5.0))
