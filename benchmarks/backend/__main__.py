@@ -50,9 +50,8 @@ def main() -> int:
     parser.add_argument("--outliers", type=float, nargs="*", default=[0.0, 0.1, 0.2, 0.3, 0.4])
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--families", nargs="*", default=list(FAMILIES))
-    parser.add_argument(
-        "--sources", nargs="*", default=["forge", "coherent", "layouts", "colmap", "real"]
-    )
+    parser.add_argument("--layouts", nargs="*", default=list(LAYOUTS))
+    parser.add_argument("--sources", nargs="*", default=["forge", "coherent", "layouts", "colmap", "real"])
     parser.add_argument("--methods", nargs="*", default=list(METHODS))
     parser.add_argument("--positions", nargs="*", default=[], choices=POSITIONS, help="how to position")
     parser.add_argument("--timeout", type=float, default=300.0, help="seconds per method and problem")
@@ -97,7 +96,7 @@ def problems(arguments: argparse.Namespace) -> Iterator[Problem]:
                     if "coherent" in arguments.sources and family in SYMMETRIC_CASES:
                         yield forge(family, cameras, outliers, True, seed)
                 if "layouts" in arguments.sources:
-                    for layout in LAYOUTS:
+                    for layout in arguments.layouts:
                         yield lay_out(layout, cameras, outliers, seed)
                 if "colmap" in arguments.sources and cameras <= 300:
                     yield synthesize(cameras, outliers, seed)

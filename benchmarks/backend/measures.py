@@ -21,7 +21,7 @@ def rotation_errors_deg(averaged: Array, truth: Array) -> Array:
 def position_errors_percent(
     rotations: Array, centers: Array, truth_rotations: Array, truth_centers: Array
 ) -> Array:
-    """Distances (K,) to the truth of the K cameras that have a pose in both, after a robust Sim(3) alignment.
+    """Distances (K,) to the truth of the K cameras that have a pose in both, after robust Sim(3) alignment.
 
     In per cent of the diagonal of the box that holds the true centres.
 

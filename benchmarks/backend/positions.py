@@ -53,7 +53,7 @@ def chain_refined(problem: PositioningProblem, seed: int) -> Array:
 
 
 def position_as_colmap(problem: PositioningProblem, seed: int) -> Array:
-    """pycolmap's global positioning with its default options: from random places, all longer tracks."""
+    """Pycolmap's global positioning with its default options: from random places, all longer tracks."""
     views = np.bincount(problem.ray_tracks)
     long = problem.select_rays(views[problem.ray_tracks] >= COLMAP_MIN_VIEWS)
     return GlobalPositioning(ALL_RAYS, COLMAP_LOSS_SCALE).position(long, seed)

@@ -13,7 +13,7 @@ Row = dict[str, str]
 
 
 def render(rows: list[Row]) -> str:
-    """Markdown: rotations, then positions, each over seeds; where there are positions, first an overview."""
+    """Markdown: rotations, then positions, each over seeds; before them an overview of positions."""
     versions = ", ".join(
         f"{name} {importlib.metadata.version(name)}" for name in ("snakesfm", "pycolmap", "gtsam", "numpy")
     )
@@ -28,9 +28,9 @@ def render(rows: list[Row]) -> str:
             "",
             *commands,
             "",
-            "Seconds are of the processor, of all threads; MiB are the largest memory above what Python, the"
-            " libraries and the problem take. Cells are the median over seeds, in brackets the smallest and the"
-            " largest.",
+            "Seconds are of the processor, of all threads; MiB are the largest memory above what Python,"
+            " the libraries and the problem take. Cells are the median over seeds, in brackets the smallest"
+            " and the largest.",
             *(overview(positioned) if positioned else []),
             *rotation_table([row for row in rows if not row["positions"]]),
             *(position_table(positioned) if positioned else []),
