@@ -208,7 +208,7 @@ def synthesize(cameras: int, outliers: float, seed: int) -> Problem:
 
 
 def lay_out(layout: Layout, cameras: int, outliers: float, seed: int) -> Problem:
-    """A problem of snakesfm.synthetic: narrow views, occlusion, 40 points per camera, half a pixel of noise.
+    """A problem of snakesfm.synthetic: narrow views, occlusion, 40 points a camera, half a pixel of noise.
 
     Rotations of edges are off by 0.3 degrees, directions by 0.6, as their covariances say. Beside the wrong
     edges, rays of half as large a share see something else than the others of their track.
