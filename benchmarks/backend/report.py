@@ -42,15 +42,18 @@ def render(rows: list[Row]) -> str:
 def overview(rows: list[Row]) -> list[str]:
     """Lines: position errors by method and share of wrong pairs, over families and seeds."""
     shares = sorted({float(row["outliers"]) for row in rows})
+    columns = " | ".join(f"{share:.0%}" for share in shares)
     lines = [
         "",
         "## Positions at a glance",
         "",
-        "Mean position error in per cent of the scene's extent: the median over families and seeds, and in"
-        " brackets the largest; *failed* counts problems without a result. Columns: share of wrong pairs.",
+        "Mean position error in per cent of the scene's extent, over the images that have a centre: the"
+        " median over families and seeds, and in brackets the largest; *failed* counts problems without a"
+        " result. Columns: share of wrong pairs. *Placed*: images that have a centre, on average and at"
+        " least.",
         "",
-        f"| cameras | rotations | positions | {' | '.join(f'{share:.0%}' for share in shares)} | s |",
-        "|---|---|---|" + "---|" * (len(shares) + 1),
+        f"| cameras | rotations | positions | {columns} | placed | s |",
+        "|---|---|---|" + "---|" * (len(shares) + 2),
     ]
     for (cameras, method, positions), group in _grouped(rows, "cameras", "method", "positions").items():
         cells = []
@@ -60,6 +63,8 @@ def overview(rows: list[Row]) -> list[str]:
             failed = len(mine) - len(values)
             cell = f"{np.median(values):.3f} ({max(values):.3f})" if values else ""
             cells.append(f"{cell} {failed} failed".strip() if failed else cell)
+        placed = [count / int(cameras) for count in _values(group, "images")] or [0.0]
+        cells.append(f"{np.mean(placed):.0%} ({min(placed):.0%})")
         seconds = f"{np.median(_values(group, 'cpu_s') or [np.nan]):.1f}"
         lines.append(f"| {cameras} | {method} | {positions} | {' | '.join(cells)} | {seconds} |")
     return lines

@@ -115,11 +115,11 @@ def test_positions_are_told_by_family_and_at_a_glance():
     placed = ROW | {"positions": "chain", "mean_percent": "0.5", "median_percent": "0.25"}
     rows = [
         placed,
-        placed | {"problem": "area", "mean_percent": "1.5"},
+        placed | {"problem": "area", "mean_percent": "1.5", "images": "40"},
         placed | {"outliers": "0.0", "failure": "ValueError", "mean_percent": ""},
     ]
     glance = overview(rows)[-1]
-    assert glance == "| 50 | colmap | chain | 1 failed | 1.000 (1.500) | 0.2 |"
+    assert glance == "| 50 | colmap | chain | 1 failed | 1.000 (1.500) | 90% (80%) | 0.2 |"
     table = position_table(rows)
     assert table[-3] == (
         "| ring | 50 | 30% | colmap | chain | 50 | 0.400 | 0.500 (0.500 to 0.500) | 0.250 | 0.2 | 12 |"
