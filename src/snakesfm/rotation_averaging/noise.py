@@ -1,5 +1,6 @@
 """How far the relative rotations of a graph can be trusted: a noise model fitted to their residuals."""
 
+import itertools
 from typing import Any
 
 import numpy as np
@@ -20,7 +21,8 @@ def fit_noise(residuals: Array, given: Array) -> Array:
     """Scale covariances, on top of an isotropic floor, so that the residuals are most likely.
 
     Two-view covariances know nothing of wrong intrinsics or mismatches and are often too small. Several
-    floors are tried; with the largest one all edges weigh the same.
+    floors are tried; with the largest one all edges weigh the same. Covariances whose axes the residuals do
+    not bear out, as of surfaces seen from one side, are made isotropic.
 
     Parameters
     ----------
@@ -31,10 +33,11 @@ def fit_noise(residuals: Array, given: Array) -> Array:
     -------
     (E,3,3) rad^2.
     """
-    unit = float(np.median(np.trace(given, axis1=1, axis2=2))) / 3.0
+    means = np.trace(given, axis1=1, axis2=2) / 3.0
+    unit = float(np.median(means))
     best, best_likelihood = given, -np.inf
-    for floor in FLOORS:
-        shaped = given / unit + floor * np.eye(3)
+    for shape, floor in itertools.product((given, means[:, None, None] * np.eye(3)), FLOORS):
+        shaped = shape / unit + floor * np.eye(3)
         squares = squared_lengths(residuals, np.linalg.inv(shaped))
         scale = _scale(squares)
         tails = (DEGREES_OF_FREEDOM + 3.0) * np.log1p(squares / scale / DEGREES_OF_FREEDOM)

@@ -89,6 +89,18 @@ def test_noise_model_prefers_equal_weights_to_meaningless_covariances():
     assert np.percentile(deviations, 90) < 1.5 * np.percentile(deviations, 10)
 
 
+def test_axes_that_the_residuals_do_not_bear_out_are_dropped():
+    rng = np.random.default_rng(6)
+    axes = Rotation.random(300, rng).as_matrix()
+    sizes = rng.uniform(0.5, 2.0, 300)[:, None] * np.array([[1e-4, 1e-5, 1e-6]])
+    given = axes @ (sizes[:, :, None] * axes.transpose(0, 2, 1))
+    along = np.einsum("eij,ej->ei", axes, rng.normal(size=(300, 3)) * np.sqrt(sizes))
+    alike = rng.normal(size=(300, 3)) * np.sqrt(sizes.mean(axis=1, keepdims=True))
+    for residuals, least, most in ((along, 5.0, 120.0), (alike, 1.0, 1.5)):
+        values = np.linalg.eigvalsh(fit_noise(residuals, given))
+        assert least < np.median(values[:, 2] / values[:, 0]) < most
+
+
 def test_noise_model_survives_zero_residuals():
     assert np.isfinite(fit_noise(np.zeros((5, 3)), np.tile(np.eye(3), (5, 1, 1)))).all()
 
