@@ -212,7 +212,7 @@ def test_a_run_goes_on_when_slurm_is_back(
     time.sleep(OUTAGE_S)
     assert run.poll() is None
     cluster.start_controller()
-    text, _ = run.communicate(timeout=120)
+    text, _ = run.communicate(timeout=300)
     assert run.returncode == 0, text
     assert (output / "render_report" / "index.html").is_file()
     assert model_bytes(output) == model_bytes(finished[0])
