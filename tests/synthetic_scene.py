@@ -12,6 +12,7 @@ from snakesfm.artifacts import (
     TwoViewGeometries,
     ViewGraph,
 )
+from snakesfm.bundle.model import BundleModel
 from snakesfm.geometry.camera import cameras_to_columns
 from snakesfm.view_graph.components import label_components
 
@@ -61,6 +62,20 @@ def write_scene(made, folder):
         "features": write_features(made, folder),
         "geometries": write_geometries(made, folder),
     }
+
+
+def true_model(made):
+    """The truth as the model that bundle adjustment takes."""
+    return BundleModel(
+        made.cameras,
+        made.camera_ids,
+        made.rotations,
+        made.translations,
+        made.points,
+        made.track_offsets,
+        made.track_image_ids,
+        made.track_keypoint_ids,
+    )
 
 
 def side_by_side(first, second):

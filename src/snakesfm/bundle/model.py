@@ -44,6 +44,11 @@ class BundleModel:
     image_ids: Array
     keypoint_ids: Array
 
+    @property
+    def registered(self) -> Array:
+        """Which images (N,) bool have a pose."""
+        return np.asarray(np.isfinite(self.rotations[:, 0, 0]) & np.isfinite(self.translations[:, 0]))
+
 
 def to_reconstruction(
     model: BundleModel, keypoints: Sequence[Array], names: Sequence[str]
@@ -59,7 +64,7 @@ def to_reconstruction(
     reconstruction = pycolmap.Reconstruction()
     for row, camera in enumerate(model.cameras):
         reconstruction.add_camera_with_trivial_rig(camera.to_pycolmap(row + 1))
-    posed = np.isfinite(model.rotations[:, 0, 0]) & np.isfinite(model.translations[:, 0])
+    posed = model.registered
     for row, name in enumerate(names):
         image = pycolmap.Image(
             name=str(name),

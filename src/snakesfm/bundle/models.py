@@ -31,11 +31,6 @@ def restrict_to(model: BundleModel, images: Array) -> BundleModel:
     )
 
 
-def registered_in(model: BundleModel) -> Array:
-    """Which images (N,) bool have a pose."""
-    return np.asarray(np.isfinite(model.rotations[:, 0, 0]) & np.isfinite(model.translations[:, 0]))
-
-
 def join_models(models: Sequence[BundleModel], cameras: tuple[Camera, ...]) -> tuple[BundleModel, Array]:
     """All models in one, and the model of each image (N,) int32, -1 where it is in none.
 
@@ -45,7 +40,7 @@ def join_models(models: Sequence[BundleModel], cameras: tuple[Camera, ...]) -> t
     labels = np.full(len(first.camera_ids), -1, dtype=np.int32)
     rotations, translations = first.rotations.copy(), first.translations.copy()
     for number, model in enumerate(models):
-        mine = registered_in(model)
+        mine = model.registered
         labels[mine] = number
         rotations[mine], translations[mine] = model.rotations[mine], model.translations[mine]
     lengths = np.concatenate([np.diff(model.offsets) for model in models])

@@ -73,6 +73,17 @@ def build_reconstruction(
     return model
 
 
+def other_model_sizes(models: Array) -> list[int]:
+    """Images of each model beside the first.
+
+    Parameters
+    ----------
+    models : (N,) model of each image, 0 the first; -1 where it has no pose.
+    """
+    sizes: list[int] = np.bincount(models[models > 0])[1:].tolist()
+    return sizes
+
+
 def summarize(
     scene: str,
     names: Sequence[str],
@@ -94,7 +105,7 @@ def summarize(
         "scene": scene,
         "images": len(names),
         "registered_images": int(np.count_nonzero(models == 0)),
-        "images_in_other_models": np.bincount(models[models > 0])[1:].tolist(),
+        "images_in_other_models": other_model_sizes(models),
         "not_registered": [names[row] for row in np.flatnonzero(models < 0).tolist()],
         "points": len(lengths),
         "observations": observations,

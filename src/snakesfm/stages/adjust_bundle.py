@@ -21,7 +21,7 @@ from snakesfm.bundle.model import (
     reprojection_errors,
     to_reconstruction,
 )
-from snakesfm.bundle.models import join_models, registered_in, restrict_to
+from snakesfm.bundle.models import join_models, restrict_to
 from snakesfm.bundle.reading import observed_keypoints
 from snakesfm.bundle.rounds import (
     ImageSource,
@@ -72,21 +72,21 @@ def run(job: StageJob) -> None:
     records: list[RoundRecord] = []
     for component in range(int(averaged.components.max(initial=0)) + 1):
         part = restrict_to(replace(model, cameras=cameras), (averaged.components == component) & ~taken)
-        if registered_in(part).sum() < (SMALLEST_FURTHER_MODEL if component else 2):
+        if part.registered.sum() < (SMALLEST_FURTHER_MODEL if component else 2):
             continue
         prefix = f"part {component + 1}, " if component else ""
         result, observed, rounds = _adjust(job, index, part, graph, keypoints, taken, prefix)
         records += rounds
         cameras = result.cameras
-        if registered_in(result).sum() >= 2:
+        if result.registered.sum() >= 2:
             adjusted.append((result, observed))
-            taken |= registered_in(result)
+            taken |= result.registered
     if not adjusted:
         raise SceneError(
             f"Scene '{job.scene}': bundle adjustment kept fewer than two images: the averaged poses do not "
             "fit the tracks; check the cameras' focal lengths, or lower adjust_bundle.min_observations."
         )
-    adjusted.sort(key=lambda found: -registered_in(found[0]).sum())
+    adjusted.sort(key=lambda found: -found[0].registered.sum())
     joined, models = join_models([found for found, _ in adjusted], cameras)
     pixels = np.concatenate([observed for _, observed in adjusted])
     _write(job, joined, models, pixels, keypoints, colors, records)
@@ -126,7 +126,7 @@ def _adjust(
         function_tolerance=options.function_tolerance,
     )
     shared = options.model_dump(include=set(RoundSettings.__dataclass_fields__))
-    shared["min_track_length"] = min(options.min_track_length, max(2, int(registered_in(model).sum())))
+    shared["min_track_length"] = min(options.min_track_length, max(2, int(model.registered.sum())))
     settings = RoundSettings(**shared, seed=job.seed_for("bundle"))
     refines = options.refine_keypoints
     if refines == "auto":
@@ -146,7 +146,7 @@ def _adjust(
 
 def _usable_pairs(graph: ViewGraph, model: BundleModel) -> np.ndarray:
     """Edges that the filters kept, and all edges of images that averaging left out."""
-    posed = registered_in(model)[graph.pairs].all(axis=1)
+    posed = model.registered[graph.pairs].all(axis=1)
     usable: np.ndarray = graph.pairs[(graph.labels == 0) | ~posed]
     return usable
 

@@ -7,10 +7,13 @@ import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from snakesfm.artifacts import ImageIndex, Reconstruction
-from snakesfm.export.colmap import build_reconstruction, registered_images, summarize
+from snakesfm.export.colmap import (
+    build_reconstruction,
+    other_model_sizes,
+    registered_images,
+    summarize,
+)
 from snakesfm.export.image_folder import place_images
 from snakesfm.export.nerfstudio import camera_warnings, transforms
 from snakesfm.export.undistorted import write_undistorted
@@ -47,7 +50,7 @@ def run(job: StageJob) -> None:
     warnings = [line for row in used for line in camera_warnings(cameras[row], row + 1)]
     if any(" " in names[row] for row in registered):
         warnings.append(SPACES)
-    others = np.bincount(adjusted.models[adjusted.models > 0])[1:].tolist()
+    others = other_model_sizes(adjusted.models)
     if others:
         warnings.append(OTHER_MODELS.format(images=sum(others), count=len(others)))
     for line in warnings:
@@ -62,7 +65,8 @@ def run(job: StageJob) -> None:
         for number in range(max(1, adjusted.model_count)):
             folder_of = sparse / str(number)
             folder_of.mkdir(parents=True)
-            colmap = _build(names, index, cameras, adjusted.select_model(number))
+            selected = adjusted.select_model(number) if number else model
+            colmap = _build(names, index, cameras, selected)
             colmap.write_binary(str(folder_of))
             colmap.write_text(str(folder_of))
             if number == 0:

@@ -5,11 +5,12 @@ from dataclasses import replace
 import cv2  # noqa: F401
 import numpy as np
 import pytest
+from synthetic_scene import true_model
 
 from snakesfm.bundle import rounds
 from snakesfm.bundle.completion import correspondence_graph
 from snakesfm.bundle.interface import SolverSettings
-from snakesfm.bundle.model import BundleModel, from_reconstruction, to_reconstruction
+from snakesfm.bundle.model import from_reconstruction, to_reconstruction
 from snakesfm.geometry.camera import Camera
 from snakesfm.synthetic.problems import make_problem
 
@@ -34,16 +35,7 @@ def passes(monkeypatch):
 def adjusted(solving=None, **changes):
     """The camera that the rounds find from a wrong focal length without distortion."""
     made = make_problem(12, 600, noise_px=0.2, camera=TRUE, seed=5)
-    model = BundleModel(
-        (START,),
-        made.camera_ids,
-        made.rotations,
-        made.translations,
-        made.points,
-        made.track_offsets,
-        made.track_image_ids,
-        made.track_keypoint_ids,
-    )
+    model = replace(true_model(made), cameras=(START,))
     reconstruction = to_reconstruction(model, made.keypoints, [f"{k}.jpg" for k in range(12)])
     rounds.adjust_rounds(
         reconstruction,

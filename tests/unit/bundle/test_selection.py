@@ -5,10 +5,11 @@ from dataclasses import replace
 import cv2  # noqa: F401
 import numpy as np
 import pytest
+from synthetic_scene import true_model
 
 from snakesfm.bundle.ceres import adjust_ceres
 from snakesfm.bundle.interface import SolverSettings
-from snakesfm.bundle.model import BundleModel, from_reconstruction, to_reconstruction
+from snakesfm.bundle.model import from_reconstruction, to_reconstruction
 from snakesfm.bundle.selection import adjust_selection, select_points
 from snakesfm.geometry.poses import center_of
 from snakesfm.synthetic.problems import make_problem
@@ -19,16 +20,7 @@ NAMES = [f"{k}.jpg" for k in range(12)]
 def perturbed(noise_px=0.3):
     """The true model, one with moved points and cameras, and the first as pycolmap's."""
     made = make_problem(12, 600, noise_px=noise_px, seed=3)
-    model = BundleModel(
-        made.cameras,
-        made.camera_ids,
-        made.rotations,
-        made.translations,
-        made.points,
-        made.track_offsets,
-        made.track_image_ids,
-        made.track_keypoint_ids,
-    )
+    model = true_model(made)
     rng = np.random.default_rng(0)
     moved = replace(
         model,

@@ -5,11 +5,10 @@ import json
 import numpy as np
 import pycolmap
 import pytest
-from synthetic_scene import HEADER, side_by_side, write_scene
+from synthetic_scene import HEADER, side_by_side, true_model, write_scene
 
 from snakesfm.artifacts import CameraCenters, CameraRotations, Reconstruction
-from snakesfm.bundle.model import BundleModel
-from snakesfm.bundle.models import join_models, registered_in, restrict_to
+from snakesfm.bundle.models import join_models, restrict_to
 from snakesfm.config.adjust_bundle import AdjustBundleOptions
 from snakesfm.config.average_rotations import AverageRotationsOptions
 from snakesfm.config.average_translations import AverageTranslationsOptions
@@ -140,23 +139,10 @@ def test_models_that_are_gone_leave_no_folder(scene, tmp_path):
     assert sorted(path.name for path in (tmp_path / "sparse").iterdir()) == ["0", "1"]
 
 
-def whole_model(made):
-    return BundleModel(
-        made.cameras,
-        made.camera_ids,
-        made.rotations,
-        made.translations,
-        made.points,
-        made.track_offsets,
-        made.track_image_ids,
-        made.track_keypoint_ids,
-    )
-
-
 def test_parts_of_a_model_joined_again_are_the_model(made):
-    model = whole_model(made)
+    model = true_model(made)
     parts = [restrict_to(model, images) for images in (~PART, PART)]
-    assert [int(registered_in(part).sum()) for part in parts] == [SMALL, LARGE]
+    assert [int(part.registered.sum()) for part in parts] == [SMALL, LARGE]
     joined, labels = join_models(parts, made.cameras)
     np.testing.assert_array_equal(labels, PART.astype(int))
     for name in ("rotations", "translations", "points", "offsets", "image_ids", "keypoint_ids"):
@@ -164,7 +150,7 @@ def test_parts_of_a_model_joined_again_are_the_model(made):
 
 
 def test_a_point_that_one_image_of_a_part_sees_is_none_of_it(made):
-    model = whole_model(made)
+    model = true_model(made)
     images = np.arange(COUNT) < 3
     part = restrict_to(model, images)
     assert images[part.image_ids].all() and np.diff(part.offsets).min() >= 2
