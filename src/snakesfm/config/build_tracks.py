@@ -10,7 +10,7 @@ from snakesfm.config.base import StageOptions
 class BuildTracksOptions(StageOptions):
     """How matches are joined to tracks."""
 
-    stage_version: ClassVar[int] = 4
+    stage_version: ClassVar[int] = 5
 
     min_length: int = Field(default=3, ge=2)
     """Images that a track must be seen in; 2 where only two images have a rotation."""
@@ -18,5 +18,5 @@ class BuildTracksOptions(StageOptions):
     merge_radius_px: float = Field(default=1.0, ge=0.0, le=20.0)
     """Keypoints of one image nearer than this count as one observation of a track."""
 
-    split_conflicts: bool = True
+    split_conflicts: bool = False
     """Split a track that sees an image twice at its weakest link; otherwise drop the track."""

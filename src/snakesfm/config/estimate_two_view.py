@@ -10,7 +10,7 @@ from snakesfm.config.base import StageOptions
 class EstimateTwoViewOptions(StageOptions):
     """How the relative pose of a pair is estimated, refined and accepted."""
 
-    stage_version: ClassVar[int] = 2
+    stage_version: ClassVar[int] = 3
 
     estimator: Literal["poselib", "opencv_gcransac", "opencv_magsac", "pycolmap"] = "poselib"
     """Robust estimator of the essential matrix."""
@@ -24,7 +24,7 @@ class EstimateTwoViewOptions(StageOptions):
     max_adapted_error_px: float = Field(default=3.0, gt=0, le=50)
     """Upper bound of the adapted threshold."""
 
-    max_iterations: int = Field(default=500, ge=10, le=1_000_000)
+    max_iterations: int = Field(default=250, ge=10, le=1_000_000)
     """Upper bound of the hypotheses of one robust estimation."""
 
     refine: Literal["none", "sampson", "bundle"] = "sampson"

@@ -21,7 +21,7 @@ class Tracks:
     image_ids : (L,) int32, ascending within a track.
     keypoint_ids : (L,) int32, row of the keypoint in its image.
     part_ids : (L,) int32, parts of tracks that hang together by confirmed matches, over all tracks.
-    conflicts : components of matches that saw an image twice.
+    conflicts : components of matches that saw an image at two places.
     """
 
     offsets: Array
@@ -38,15 +38,15 @@ def build_tracks(
     matches: Array,
     min_length: int = 3,
     merge_radius_px: float = 1.0,
-    split: bool = True,
+    split: bool = False,
 ) -> Tracks:
     """Join matches to tracks that see each image at most once.
 
-    Connected components of the match graph. Those that see an image at two places are split at their
-    weakest links (see :func:`snakesfm.tracks.split.split_conflicts`), a link's strength being the number of
-    3-cycles that confirm it, then the number of matches of its pair. SIFT gives one place once per dominant
-    orientation; such keypoints make tracks of their own unless a match joins them. Without the links of
-    :func:`snakesfm.tracks.split.unconfirmed_links` a track falls into parts.
+    Connected components of the match graph. Those that see an image at two places are dropped, or split at
+    their weakest links (see :func:`snakesfm.tracks.split.split_conflicts`), a link's strength being the
+    number of 3-cycles that confirm it, then the matches of its pair. SIFT gives one place once per
+    dominant orientation; such keypoints make tracks of their own unless a match joins them. Without the
+    links of :func:`snakesfm.tracks.split.unconfirmed_links` a track falls into parts.
 
     Parameters
     ----------
@@ -79,12 +79,12 @@ def build_tracks(
     images = (np.searchsorted(base, nodes, side="right") - 1).astype(np.int64)
     parts = _components(links[~unconfirmed_links(links, images)], len(nodes))
     labels = _components(links, len(nodes))
-    in_conflict = _conflicting(labels, images)
+    positions = np.concatenate(keypoints)[nodes] if len(nodes) else np.zeros((0, 2))
+    in_conflict = _conflicting(labels, images, positions, merge_radius_px)
     conflicts = len(np.unique(labels[in_conflict]))
     if not split:
         labels[in_conflict] = -1
     elif conflicts:
-        positions = np.concatenate(keypoints)[nodes]
         inside = in_conflict[links[:, 0]]
         rows, sub = np.unique(links[inside], return_inverse=True)
         sub = sub.reshape(-1, 2).astype(np.int64)
@@ -104,13 +104,17 @@ def _components(links: Array, count: int) -> Array:
     return np.asarray(connected_components(graph, directed=False)[1], dtype=np.int64)
 
 
-def _conflicting(labels: Array, images: Array) -> Array:
-    """Nodes (K,) bool of components that hold two keypoints of one image."""
+def _conflicting(labels: Array, images: Array, positions: Array, merge_radius_px: float) -> Array:
+    """Nodes (K,) bool of components that see one image at places further apart than ``merge_radius_px``."""
     # nodes ascend by image
     order = np.argsort(labels, kind="stable")
-    same = (np.diff(labels[order]) == 0) & (np.diff(images[order]) == 0)
+    groups = np.r_[True, (np.diff(labels[order]) != 0) | (np.diff(images[order]) != 0)][: len(order)]
+    starts = np.flatnonzero(groups)
     bad = np.zeros(int(labels.max(initial=-1)) + 1, dtype=bool)
-    bad[labels[order][1:][same]] = True
+    if len(starts) < len(order):
+        points = positions[order]
+        extent = np.maximum.reduceat(points, starts) - np.minimum.reduceat(points, starts)
+        bad[labels[order][starts[np.hypot(*extent.T) > merge_radius_px]]] = True
     return np.asarray(bad[labels])
 
 

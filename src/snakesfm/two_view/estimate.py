@@ -13,7 +13,7 @@ from snakesfm.two_view.correspondences import correspond, one_to_one
 from snakesfm.two_view.covariance import DIRECTION_UNKNOWN_VARIANCE
 from snakesfm.two_view.estimators import ESTIMATORS, RobustPose
 from snakesfm.two_view.kinds import fit_homography, fit_rotation, planar_twins, transfer_errors_px
-from snakesfm.two_view.refinement import SIGMA_FLOOR_PX, RefinedPose, refine_pose
+from snakesfm.two_view.refinement import SIGMA_FLOOR_PX, RefinedPose, descend_sampson, refine_pose
 from snakesfm.two_view.sampson import Correspondences, cauchy_cost, sampson_errors_px
 from snakesfm.two_view.significance import significance_of
 
@@ -254,7 +254,7 @@ def _kind_of(
     kind = "planar" if explained >= needed else "general"
     if options.min_ambiguity_gap == 0 or explained < TWIN_PLANE_RATIO * len(inliers):
         return kind, False
-    gaps = [_gap_to(inliers, refined, twin, selection_px, options) for twin in planar_twins(H)]
+    gaps = [_gap_to(inliers, refined, twin, selection_px) for twin in planar_twins(H)]
     return kind, min(gaps, default=np.inf) < options.min_ambiguity_gap
 
 
@@ -263,7 +263,6 @@ def _gap_to(
     refined: RefinedPose,
     twin: tuple[Array, Array],
     selection_px: float,
-    options: "EstimateTwoViewOptions",
 ) -> float:
     """Log-likelihood of the inliers lost by another pose; infinite if it is no rival."""
     scale = 2.0 * max(refined.sigma_px, TWIN_NOISE_FLOOR_PX)
@@ -271,11 +270,11 @@ def _gap_to(
         return float("inf")
     if _agreeing(inliers, twin, refined.sigma_px, 3.0 * selection_px) < TWIN_START_RATIO * len(inliers):
         return float("inf")
-    rival = refine_pose(inliers, *twin, "sampson", selection_px, options.loss_scale)
-    found = (rival.rotation, rival.translation)
-    if _same_pose(refined, found):
+    start = descend_sampson(inliers, *twin, max(scale, selection_px))
+    rival = descend_sampson(inliers, *start, scale)
+    if _same_pose(refined, rival):
         return float("inf")
-    if _agreeing(inliers, found, rival.sigma_px, selection_px) < TWIN_INLIER_RATIO * len(inliers):
+    if _agreeing(inliers, rival, refined.sigma_px, selection_px) < TWIN_INLIER_RATIO * len(inliers):
         return float("inf")
     own = sampson_errors_px(inliers, refined.rotation, refined.translation)
-    return 2.0 * (cauchy_cost(rival.errors_px, scale) - cauchy_cost(own, scale))
+    return 2.0 * (cauchy_cost(sampson_errors_px(inliers, *rival), scale) - cauchy_cost(own, scale))

@@ -94,15 +94,21 @@ def _refine(
         return rotation, translation
     if method == "bundle":
         return refine_bundle(points, rotation, translation, scale_px, 10)
-    if far:
-        return _refine_poselib(points, rotation, translation, scale_px)
-    # PoseLib weighs both images alike; this weighs each by its focal length
+    # PoseLib weighs both images alike, refine_sampson each by its focal length
+    if far or points.focal_i == points.focal_j:
+        return descend_sampson(points, rotation, translation, scale_px)
     return refine_sampson(points, rotation, translation, scale_px, 5)
 
 
-def _refine_poselib(
+def descend_sampson(
     points: Correspondences, rotation: Array, translation: Array, scale_px: float
 ) -> tuple[Array, Array]:
+    """The pose (3,3), unit (3,) of least Cauchy loss of the Sampson error near another, by PoseLib.
+
+    Parameters
+    ----------
+    scale_px : scale of the loss in pixels of the mean focal length.
+    """
     focal = points.mean_focal
     camera = poselib_camera(focal)
     start = poselib.CameraPose()

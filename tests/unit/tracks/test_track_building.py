@@ -61,7 +61,7 @@ def two_tracks_with_a_wrong_link():
 
 
 def test_unconfirmed_match_joins_no_parts_and_conflicts_are_split():
-    tracks = build_tracks(spread_keypoints(4, 2), *matches_of(two_tracks_with_a_wrong_link()))
+    tracks = build_tracks(spread_keypoints(4, 2), *matches_of(two_tracks_with_a_wrong_link()), split=True)
     assert tracks.conflicts == 1
     assert as_sets(tracks) == parts_of(tracks) == [[(i, 0) for i in range(4)], [(i, 1) for i in range(4)]]
 
@@ -100,16 +100,16 @@ def test_image_whose_matches_are_mostly_unconfirmed_keeps_them():
     assert parts_of(tracks) == [[(i, k) for i in range(5)] for k in range(3)]
 
 
-def test_conflict_is_dropped_whole_where_splitting_is_off():
+def test_conflict_is_dropped_whole_unless_it_is_to_be_split():
     table = {(0, 1): [(0, 0)], (1, 2): [(0, 0)], (2, 3): [(0, 0)], (0, 3): [(1, 0)]}
-    tracks = build_tracks(spread_keypoints(4, 2), *matches_of(table), split=False)
+    tracks = build_tracks(spread_keypoints(4, 2), *matches_of(table))
     assert as_sets(tracks) == [] and tracks.conflicts == 1
 
 
 def test_pair_with_fewer_matches_is_cut_where_no_cycle_decides():
     keypoints = spread_keypoints(4, 12)
     table = {(0, 1): [(0, 0), *((k, k) for k in range(2, 9))], (1, 2): [(0, 0), (9, 9)], (0, 2): [(1, 0)]}
-    tracks = build_tracks(keypoints, *matches_of(table), min_length=2)
+    tracks = build_tracks(keypoints, *matches_of(table), min_length=2, split=True)
     assert [(0, 0), (1, 0), (2, 0)] in as_sets(tracks)
     assert not any((0, 1) in track for track in as_sets(tracks))
 
@@ -119,10 +119,9 @@ def test_near_keypoints_of_one_image_are_one_observation():
     keypoints[1][1] = keypoints[1][0] + np.float32(0.5)
     table = {(0, 1): [(0, 0)], (1, 2): [(1, 0)], (0, 2): [(0, 0)]}
     joined = build_tracks(keypoints, *matches_of(table), merge_radius_px=1.0)
-    assert as_sets(joined) == [[(0, 0), (1, 0), (2, 0)]]
-    assert as_sets(build_tracks(keypoints, *matches_of(table), merge_radius_px=0.1)) != [
-        [(0, 0), (1, 1), (2, 0)]
-    ]
+    assert as_sets(joined) == [[(0, 0), (1, 0), (2, 0)]] and joined.conflicts == 0
+    apart = build_tracks(keypoints, *matches_of(table), merge_radius_px=0.4)
+    assert as_sets(apart) == [] and apart.conflicts == 1
 
 
 def test_cycle_support_counts_triangles():
