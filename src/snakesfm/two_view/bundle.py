@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from snakesfm.two_view.sampson import GENERATORS, Correspondences, cauchy_cost, cauchy_weights, solve_damped
-from snakesfm.two_view.tangents import perturb_pose, tangent_basis
+from snakesfm.two_view.tangents import cross_matrix, perturb_pose, tangent_basis
 
 Array = NDArray[Any]
 
@@ -17,12 +17,11 @@ def inverse_depths(points: Correspondences, rotation: Array, translation: Array)
     Negative where the rays meet behind camera i, 0 where they are parallel.
     """
     turned = points.rays_i @ rotation.T
-    # ray_j x (turned + rho t) = 0 in the least squares sense
-    left = np.cross(points.rays_j, np.broadcast_to(translation, points.rays_j.shape))
-    right = np.cross(points.rays_j, turned)
-    depths: Array = -np.einsum("nk,nk->n", left, right) / np.maximum(
-        np.einsum("nk,nk->n", left, left), 1e-300
-    )
+    # ray_j x (turned + rho t) = 0 in the least squares sense; Lagrange's identity spares one cross product
+    left = points.rays_j @ cross_matrix(translation)
+    along = np.einsum("nk,nk->n", points.rays_j, points.rays_j) * (turned @ translation)
+    along -= np.einsum("nk,nk->n", points.rays_j, turned) * (points.rays_j @ translation)
+    depths: Array = -along / np.maximum(np.einsum("nk,nk->n", left, left), 1e-300)
     return depths
 
 
