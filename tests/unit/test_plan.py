@@ -59,7 +59,7 @@ def test_seeds_differ_by_what_they_are_for_and_fit_31_bits() -> None:
 
 def test_small_scenes_are_exhaustive_and_large_ones_retrieve(tmp_path: Path) -> None:
     make_images(tmp_path / "small", 5)
-    make_images(tmp_path / "large", 400)
+    make_images(tmp_path / "large", 501)
     small = plan_of(tmp_path, images=str(tmp_path / "small")).scenes["small"]
     large = plan_of(tmp_path, images=str(tmp_path / "large")).scenes["large"]
     assert small.select_pairs.method == "exhaustive"

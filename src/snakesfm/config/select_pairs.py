@@ -19,16 +19,16 @@ class SelectPairsOptions(StageOptions):
     )
     """All pairs, neighbours in the order of names, similar images, both, or a list's; 'auto' decides."""
 
-    exhaustive_up_to: int = Field(200, ge=2, le=100_000)
+    exhaustive_up_to: int = Field(500, ge=2, le=100_000)
     """Number of images up to which 'auto' takes all pairs, and sequential+retrieval beyond."""
 
     look_ahead: int = Field(10, ge=1, le=10_000)
     """How many following images, in the natural order of names, an image is paired with by 'sequential'."""
 
     top_k: int | Literal["auto"] = "auto"
-    """How many similar images 'retrieval' pairs an image with; 'auto' is 5, and 15 from 500 images on."""
+    """How many similar images 'retrieval' pairs an image with; 'auto' is 15, and 30 from 500 images on."""
 
-    min_score: float = Field(0.05, ge=-1.0, le=1.0)
+    min_score: float = Field(0.0, ge=-1.0, le=1.0)
     """Least similarity of a pair chosen by 'retrieval'."""
 
     def resolve(self, image_count: int, pairs_file: str = "") -> Self:
@@ -47,7 +47,7 @@ class SelectPairsOptions(StageOptions):
                 method = "exhaustive" if image_count <= self.exhaustive_up_to else "sequential+retrieval"
         top_k = self.top_k
         if top_k == "auto":
-            top_k = 15 if image_count >= MANY_IMAGES else 5
+            top_k = 30 if image_count >= MANY_IMAGES else 15
         return self.model_copy(update={"method": method, "top_k": top_k})
 
     @property

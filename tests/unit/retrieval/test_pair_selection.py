@@ -143,7 +143,7 @@ def test_auto_is_resolved_by_the_number_of_images():
     assert options.resolve(most).method == "exhaustive"
     assert options.resolve(most + 1).method == "sequential+retrieval"
     assert options.resolve(most, "pairs.txt").method == "listed"
-    assert (options.resolve(499).top_k, options.resolve(500).top_k) == (5, 15)
+    assert (options.resolve(499).top_k, options.resolve(500).top_k) == (15, 30)
     assert not options.resolve(2).needs_descriptors
     assert options.resolve(most + 1).needs_descriptors
     kept = SelectPairsOptions(method="retrieval", top_k=7).resolve(10)
