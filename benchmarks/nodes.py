@@ -19,6 +19,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from benchmarks.job_logs import DONE
+from benchmarks.marked_tables import replace_table
 from snakesfm.synthetic.render_demo import make_demo
 from snakesfm.synthetic.scene import DemoOptions
 from tests.slurm_cluster import Cluster, missing_programs
@@ -26,7 +27,6 @@ from tests.slurm_cluster import Cluster, missing_programs
 ROOT = Path(__file__).resolve().parents[1]
 RECORDS = Path(__file__).with_suffix(".json")
 PAGE = ROOT / "docs" / "cluster.md"
-BEGIN, END = "<!-- python -m benchmarks.nodes -->\n", "<!-- end -->\n"
 SCENE = DemoOptions(image_count=16, width=400, height=300)
 CPUS_PER_NODE = 2
 LOCAL_CORES = 2
@@ -148,9 +148,7 @@ def main() -> None:
     again = {run.nodes for run in fresh}
     runs = sorted([*(run for run in kept if run.nodes not in again), *fresh], key=lambda run: run.nodes)
     RECORDS.write_text(json.dumps([asdict(run) for run in runs], indent=1) + "\n", "utf-8")
-    text = PAGE.read_text("utf-8")
-    before, rest = text.split(BEGIN)
-    PAGE.write_text(before + BEGIN + table(runs) + END + rest.split(END, 1)[1], "utf-8")
+    replace_table(PAGE, "python -m benchmarks.nodes", table(runs))
 
 
 if __name__ == "__main__":
