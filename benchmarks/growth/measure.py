@@ -5,6 +5,7 @@ import re
 import shutil
 import subprocess
 import sys
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
@@ -49,12 +50,23 @@ class Measurement:
     """The last stage whose artifacts were simulated; the workflow ran from there."""
     pairs: int = 0
     registered: int = 0
+    config: list[str] = field(default_factory=list)
+    """Options of the workflow other than the defaults, as ``stage={option: value}``."""
     accuracy: dict[str, float] = field(default_factory=dict)
     stages: dict[str, StageNeed] = field(default_factory=dict)
 
+    def comparable(self, stage: str) -> bool:
+        """Whether a stage ran, and with its defaults."""
+        return stage in self.stages and stage not in {entry.split("=")[0] for entry in self.config}
+
 
 def measure(
-    options: SimulationOptions, folder: Path, cores: int, last: str = "", tiles: int = 0
+    options: SimulationOptions,
+    folder: Path,
+    cores: int,
+    last: str = "",
+    tiles: int = 0,
+    config: Sequence[str] = (),
 ) -> Measurement:
     """Simulate a scene where it is not there yet, run the workflow, and read its logs.
 
@@ -63,6 +75,7 @@ def measure(
     cores : for Snakemake.
     last : stage after which the workflow stops, "" for none.
     tiles : so many tiles are matched and no more is done; 0 for all.
+    config : for Snakemake's ``--config``.
     """
     if not (folder / "config.yaml").is_file():
         shutil.rmtree(folder, ignore_errors=True)
@@ -70,6 +83,8 @@ def measure(
     command = [sys.executable, "-m", "snakemake", "--snakefile", str(ROOT / "Snakefile"), "--quiet"]
     command += ["--profile", str(ROOT / "profiles" / "local"), "--cores", str(cores)]
     command += ["--configfile", str((folder / "config.yaml").resolve())]
+    if config:
+        command += ["--config", *config]
     if last:
         command += ["--until", last]
     if tiles:
@@ -79,7 +94,9 @@ def measure(
         scene = folder.resolve() / "results" / folder.name
         command += [str(scene / "estimate_two_view" / f"{name}.h5") for name in names]
     subprocess.run(command, cwd=folder, check=True, stdout=subprocess.DEVNULL)
-    return collect(options, folder)
+    result = collect(options, folder)
+    result.config = list(config)
+    return result
 
 
 def collect(options: SimulationOptions, folder: Path) -> Measurement:

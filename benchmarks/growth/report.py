@@ -89,6 +89,7 @@ def _scenes(rows: Sequence[Measurement]) -> str:
         "registered",
         "AUC 1/5 deg",
         "position %",
+        "not by default",
     ]
     lines = []
     for m in rows:
@@ -97,8 +98,12 @@ def _scenes(rows: Sequence[Measurement]) -> str:
             one, five, position = m.accuracy.values()
             accuracy = [str(m.registered), f"{one:.1f} / {five:.1f}", f"{position:.3f}"]
         pairs = [f"{m.pairs:,}", f"{2 * m.pairs / m.images:.1f}"]
-        lines.append([f"{m.images:,}", m.first, str(m.blocks), *pairs, *accuracy])
+        lines.append([f"{m.images:,}", m.first, str(m.blocks), *pairs, *accuracy, _options(m)])
     return _table(head, lines)
+
+
+def _options(m: Measurement) -> str:
+    return ", ".join(f"`{entry}`" for entry in m.config)
 
 
 def _stages(rows: Sequence[Measurement]) -> str:
@@ -109,8 +114,9 @@ def _stages(rows: Sequence[Measurement]) -> str:
         cells = []
         for m in columns:
             need = m.stages.get(stage)
-            cells.append(f"{need.cpu:.1f} s, {need.most_mb:.0f} MB" if need else "")
-        points = [(m.images, m.stages[stage].cpu) for m in columns if stage in m.stages]
+            mark = "" if m.comparable(stage) else " *"
+            cells.append(f"{need.cpu:.1f} s, {need.most_mb:.0f} MB{mark}" if need else "")
+        points = [(m.images, m.stages[stage].cpu) for m in columns if m.comparable(stage)]
         if stage in TILED:
             needs = [m.stages[stage] for m in columns if stage in m.stages]
             per = f"{' / '.join(f'{1000 * n.cpu / n.pairs:.1f}' for n in needs if n.pairs)} ms per pair"
@@ -120,7 +126,10 @@ def _stages(rows: Sequence[Measurement]) -> str:
             per = f"{' / '.join(costs)} ms per image"
         slope = exponent(points)
         lines.append([f"`{stage}`", *cells, per, f"{slope:.2f}" if slope is not None else "-"])
-    return _table(["stage", *[f"{m.images:,}" for m in columns], "cost", "p"], lines)
+    table = _table(["stage", *[f"{m.images:,}" for m in columns], "cost", "p"], lines)
+    if any(m.config for m in columns):
+        table += "\n\n\\* not by default (above), so neither in the cost nor in p."
+    return table
 
 
 def _needs(measurements: Sequence[Measurement]) -> str:
@@ -179,7 +188,7 @@ def _hours(
     if stage == "extract_features":
         total = EXTRACT_CPU_PER_IMAGE * images
         return total / 3600, total / 3600 / cores, "per image"
-    points = [(m.images, m.stages[stage].cpu) for m in measurements if stage in m.stages]
+    points = [(m.images, m.stages[stage].cpu) for m in measurements if m.comparable(stage)]
     if not points:
         return math.nan, math.nan, ""
     largest, cpu = max(points)

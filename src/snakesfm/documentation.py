@@ -3,9 +3,13 @@
 ``python -m snakesfm.documentation`` rewrites them; a test fails where they differ from the code.
 """
 
+import ast
 import dataclasses
+import functools
+import inspect
 import json
 import textwrap
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -25,8 +29,38 @@ from snakesfm.config.configuration import (
 WIDTH = 110
 
 
+@functools.cache
+def describe_options() -> None:
+    """Give the fields of all models the sentences below them.
+
+    pydantic would do it itself, but at each start of a job, which takes most of the time of making the models.
+    """
+    models: tuple[type[BaseModel], ...] = (SceneInputs, RunOptions, *map(options_class, STAGES))
+    for cls in models:
+        for name, sentence in _sentences_below(cls).items():
+            cls.model_fields[name].description = sentence
+        cls.model_rebuild(force=True)
+    whole = configuration_class()
+    for name, field in RunOptions.model_fields.items():
+        whole.model_fields[name].description = field.description
+    whole.model_rebuild(force=True)
+
+
+def _sentences_below(cls: type[BaseModel]) -> dict[str, str]:
+    """The strings that stand below the fields of a class, by field."""
+    definition = ast.parse(textwrap.dedent(inspect.getsource(cls))).body[0]
+    assert isinstance(definition, ast.ClassDef)
+    found = {}
+    for field, below in pairwise(definition.body):
+        match field, below:
+            case ast.AnnAssign(target=ast.Name(id=name)), ast.Expr(value=ast.Constant(value=str(text))):
+                found[name] = inspect.cleandoc(text)
+    return {name: text for name, text in found.items() if name in cls.model_fields}
+
+
 def render_schema() -> str:
     """JSON schema of config.yaml, for editors."""
+    describe_options()
     schema = configuration_class().model_json_schema()
     schema["$schema"] = "https://json-schema.org/draft/2020-12/schema"
     schema["title"] = "snakesfm configuration"
@@ -35,6 +69,7 @@ def render_schema() -> str:
 
 def render_config() -> str:
     """config.yaml: every option with its default and one sentence."""
+    describe_options()
     lines = [
         "# yaml-language-server: $schema=workflow/schemas/config.schema.json",
         "# Every option of snakesfm with its default. As it stands it reconstructs the demo scene ('make demo').",
@@ -71,6 +106,7 @@ def _yaml_option(name: str, field: FieldInfo, indent: str) -> list[str]:
 
 def render_configuration_page() -> str:
     """docs/configuration.md."""
+    describe_options()
     lines = [
         "# Configuration",
         "",

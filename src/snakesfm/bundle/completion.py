@@ -14,20 +14,20 @@ Array = NDArray[Any]
 
 
 def correspondence_graph(
-    keypoints: Sequence[Array], pairs: Array, offsets: Array, matches: Array
+    keypoint_counts: Sequence[int], pairs: Array, offsets: Array, matches: Array
 ) -> pycolmap.CorrespondenceGraph:
     """The inlier matches for pycolmap's triangulator.
 
     Parameters
     ----------
-    keypoints : per image (K_i,2), pixels.
+    keypoint_counts : of each image.
     pairs : (P,2) int, images i < j.
     offsets : (P+1,) int64, rows ``offsets[k]:offsets[k+1]`` of ``matches`` belong to pair k.
     matches : (M,2) int, keypoint rows in image i and in image j.
     """
     graph = pycolmap.CorrespondenceGraph()
-    for row, points in enumerate(keypoints):
-        graph.add_image(row + 1, len(points))
+    for row, count in enumerate(keypoint_counts):
+        graph.add_image(row + 1, count)
     for row, (i, j) in enumerate(pairs.tolist()):
         found = matches[offsets[row] : offsets[row + 1]]
         geometry = pycolmap.TwoViewGeometry()

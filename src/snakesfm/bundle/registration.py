@@ -43,8 +43,7 @@ def register_left_out(
     -------
     Rows of the images that were registered.
     """
-    settled = set(reconstruction.reg_image_ids()) | {row + 1 for row in refused}
-    left_out = sorted(set(reconstruction.images) - settled)
+    left_out = left_out_images(reconstruction, refused)
     if not left_out:
         return []
     observed = _ObservedKeypoints.of(reconstruction)
@@ -65,6 +64,12 @@ def register_left_out(
         if _register(reconstruction, image_id, found[image_id], max_error_px, min_inliers, min_ratio, seed):
             done.append(image_id - 1)
     return done
+
+
+def left_out_images(reconstruction: pycolmap.Reconstruction, refused: Collection[int] = ()) -> list[int]:
+    """Ids of the images without a pose, but for the rows in ``refused``."""
+    settled = set(reconstruction.reg_image_ids()) | {row + 1 for row in refused}
+    return sorted(set(reconstruction.images) - settled)
 
 
 @dataclass(frozen=True)

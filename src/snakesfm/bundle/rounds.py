@@ -20,7 +20,7 @@ from snakesfm.bundle.filtering import (
 from snakesfm.bundle.interface import BundleAdjuster, SolverSettings
 from snakesfm.bundle.keypoint_refinement import refine_keypoints
 from snakesfm.bundle.principal_points import find_told_cameras
-from snakesfm.bundle.registration import register_left_out
+from snakesfm.bundle.registration import left_out_images, register_left_out
 from snakesfm.bundle.selection import adjust_selection
 from snakesfm.geometry.camera import Camera
 
@@ -102,7 +102,7 @@ def bundle_adjuster(solver: Literal["ceres", "gtsam"]) -> BundleAdjuster:
 
 def adjust_rounds(
     reconstruction: pycolmap.Reconstruction,
-    graph: pycolmap.CorrespondenceGraph,
+    read_graph: Callable[[], pycolmap.CorrespondenceGraph],
     cameras: Sequence[Camera],
     solving: SolverSettings,
     settings: RoundSettings,
@@ -114,14 +114,14 @@ def adjust_rounds(
     Parameters
     ----------
     reconstruction : changed in place.
-    graph : inlier matches for completion and registration.
+    read_graph : gives the inlier matches for completion and registration; final rounds do not hold them.
     cameras : the intrinsics at the start.
     solving : how each pass is solved.
     settings : what is done in and between the rounds.
     report : called with each record as soon as it is there.
     source : the images, where keypoints are to be refined before the last round but one.
     """
-    mapper = _Mapper(reconstruction, graph, cameras, solving, settings, report)
+    mapper = _Mapper(reconstruction, read_graph, cameras, solving, settings, report)
     last = len(settings.thresholds_px) - 1
     if settings.rotations_first:
         mapper.round("rotations fixed", settings.thresholds_px[0] * 2, constant_rotations=True)
@@ -129,7 +129,7 @@ def adjust_rounds(
         refine_now = source is not None and row == max(last - 1, 0)
         # what completion adds is not refined, so it ends where refinement begins
         if row and settings.complete_tracks and (source is None or row < last):
-            mapper.completer()
+            mapper.complete()
         if source is not None and refine_now:
             source.report(
                 *refine_keypoints(reconstruction, source.read_gray, source.scales, source.settings)
@@ -148,14 +148,14 @@ class _Mapper:
     def __init__(
         self,
         reconstruction: pycolmap.Reconstruction,
-        graph: pycolmap.CorrespondenceGraph,
+        read_graph: Callable[[], pycolmap.CorrespondenceGraph],
         cameras: Sequence[Camera],
         solving: SolverSettings,
         settings: RoundSettings,
         report: Callable[[RoundRecord], None],
     ) -> None:
         self.reconstruction = reconstruction
-        self.graph = graph
+        self.read_graph = read_graph
         self.cameras = cameras
         self.solving = solving
         self.settings = settings
@@ -163,9 +163,7 @@ class _Mapper:
         self.records: list[RoundRecord] = []
         self.registered_late: set[int] = set()
         self.adjust = bundle_adjuster(settings.solver)
-        self.completer = TrackCompleter(
-            reconstruction, graph, settings.complete_error_px, settings.min_angle_deg, settings.seed
-        )
+        self.held_graph: pycolmap.CorrespondenceGraph | None = None
 
     def round(
         self, name: str, threshold_px: float, constant_rotations: bool = False, final: bool = False
@@ -178,6 +176,8 @@ class _Mapper:
         settings = self.settings
         solving = replace(self.solving, constant_rotations=constant_rotations)
         if final:
+            # the solver takes most memory here, and few models need their matches again
+            self.held_graph = None
             solving = replace(solving, loss_scale_px=self.loss_scale_px())
         else:
             solving = replace(
@@ -249,12 +249,32 @@ class _Mapper:
             return settings.loss_scale_px
         return settings.loss_scale_sigmas * keypoint_noise_px(self.reconstruction)
 
+    @property
+    def graph(self) -> pycolmap.CorrespondenceGraph:
+        """The inlier matches, read where they are not held."""
+        if self.held_graph is None:
+            self.held_graph = self.read_graph()
+        return self.held_graph
+
+    def complete(self, images: Sequence[int] | None = None) -> None:
+        """Complete and merge all tracks, and triangulate what ``images`` (all if None) left out."""
+        settings = self.settings
+        TrackCompleter(
+            self.reconstruction,
+            self.graph,
+            settings.complete_error_px,
+            settings.min_angle_deg,
+            settings.seed,
+        )(images)
+
     def register(self) -> bool:
         """Register what can be; whether something was.
 
         An image that the adjustment throws out again is not tried twice, or that would go on for ever.
         """
         settings = self.settings
+        if not left_out_images(self.reconstruction, self.registered_late):
+            return False
         done = register_left_out(
             self.reconstruction,
             self.graph,
@@ -266,7 +286,7 @@ class _Mapper:
         )
         self.registered_late.update(done)
         if done:
-            self.completer(done)
+            self.complete(done)
         return bool(done)
 
 

@@ -76,6 +76,10 @@ def adjust_selection(
     chosen = select_points(point_rows, images, len(points), per_image, seed)
     mine = chosen[point_rows]
     small = _part(reconstruction, points[chosen], point_rows[mine], images[mine], pixels[mine])
+    followers, owners = np.unique(point_rows[~mine], return_inverse=True)
+    images, pixels = images[~mine].astype(np.int32), pixels[~mine]
+    # the solver needs the memory
+    del point_rows, rows, mine
     costs = adjust(small, solving)
     points[chosen] = observations_of(small)[0]
     for camera_id, camera in small.cameras.items():
@@ -83,8 +87,7 @@ def adjust_selection(
     for image_id in small.reg_image_ids():
         image = reconstruction.image(image_id)
         image.frame.set_cam_from_world(image.camera_id, small.image(image_id).cam_from_world())
-    views = _Views.of(reconstruction, images[~mine], pixels[~mine])
-    followers, owners = np.unique(point_rows[~mine], return_inverse=True)
+    views = _Views.of(reconstruction, images, pixels)
     points[followers] = follow_cameras(points[followers], owners, views, solving.loss_scale_px)
     for point_id, xyz in zip(sorted(reconstruction.point3D_ids()), points, strict=True):
         reconstruction.point3D(point_id).xyz = xyz

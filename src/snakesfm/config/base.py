@@ -13,7 +13,7 @@ class StageOptions(BaseModel):
     of what Snakemake compares, so the stage and what depends on it run again.
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
+    model_config = ConfigDict(frozen=True, extra="forbid")
 
     stage_version: ClassVar[int] = 1
 

@@ -52,7 +52,7 @@ def options_class(stage: str) -> type[StageOptions]:
 class SceneInputs(BaseModel):
     """Where one scene's images and what is known about them are found."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
+    model_config = ConfigDict(frozen=True, extra="forbid")
 
     images: str
     """Folder of photographs, searched at any depth."""
@@ -86,7 +86,7 @@ FrontEndName = Literal[
 class RunOptions(BaseModel):
     """What is not the business of one stage alone."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
+    model_config = ConfigDict(frozen=True, extra="forbid")
 
     images: str = "demo/images"
     """Folder of photographs, searched at any depth; unused where `scenes` lists some."""

@@ -5,7 +5,9 @@ from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import cv2  # must be loaded before pycolmap, whose PNG library clashes otherwise
 import numpy as np
+import pycolmap
 
 from snakesfm.artifacts.gather import gather_image_columns, gather_inlier_matches
 from snakesfm.artifacts.images import CalibratedCameras, ImageIndex
@@ -54,28 +56,26 @@ def run(job: StageJob) -> None:
     columns = CalibratedCameras.read(job.path("cameras"))
     averaged = CameraRotations.read(job.path("rotations"))
     centers = CameraCenters.read(job.path("centers")).centers
-    start = TriangulatedPoints.read(job.path("points"))
-    keypoints, colors = gather_image_columns(job.paths("features"), len(index.names), "keypoints", "colors")
-    model = BundleModel(
+    poses = BundleModel(
         tuple(cameras_from_columns(columns.models, columns.sizes, columns.params, columns.sources)),
         index.camera_ids,
         averaged.rotations,
         translation_of(averaged.rotations, centers),
-        start.points,
-        start.offsets,
-        start.image_ids,
-        start.keypoint_ids,
+        points=np.zeros((0, 3)),
+        offsets=np.zeros(1, np.int64),
+        image_ids=np.zeros(0, np.int32),
+        keypoint_ids=np.zeros(0, np.int32),
     )
     graph = ViewGraph.read(job.path("graph"))
-    cameras, taken = model.cameras, np.zeros(len(index.names), dtype=bool)
+    cameras, taken = poses.cameras, np.zeros(len(index.names), dtype=bool)
     adjusted: list[tuple[BundleModel, np.ndarray]] = []
     records: list[RoundRecord] = []
     for component in range(int(averaged.components.max(initial=0)) + 1):
-        part = restrict_to(replace(model, cameras=cameras), (averaged.components == component) & ~taken)
+        part = restrict_to(replace(poses, cameras=cameras), (averaged.components == component) & ~taken)
         if part.registered.sum() < (SMALLEST_FURTHER_MODEL if component else 2):
             continue
         prefix = f"part {component + 1}, " if component else ""
-        result, observed, rounds = _adjust(job, index, part, graph, keypoints, taken, prefix)
+        result, observed, rounds = _adjust(job, index, part, graph, taken, prefix)
         records += rounds
         cameras = result.cameras
         if result.registered.sum() >= 2:
@@ -89,15 +89,14 @@ def run(job: StageJob) -> None:
     adjusted.sort(key=lambda found: -found[0].registered.sum())
     joined, models = join_models([found for found, _ in adjusted], cameras)
     pixels = np.concatenate([observed for _, observed in adjusted])
-    _write(job, joined, models, pixels, keypoints, colors, records)
+    _write(job, joined, models, pixels, records)
 
 
 def _adjust(
     job: StageJob,
     index: ImageIndex,
-    model: BundleModel,
+    poses: BundleModel,
     view_graph: ViewGraph,
-    keypoints: list[np.ndarray],
     taken: np.ndarray,
     prefix: str,
 ) -> tuple[BundleModel, np.ndarray, list[RoundRecord]]:
@@ -105,18 +104,22 @@ def _adjust(
 
     Parameters
     ----------
-    model : poses and points to start from.
+    poses : cameras and poses to start from, without points.
     taken : (N,) bool, images of other models: they stay where they are, and so do their cameras.
     prefix : goes before the names of the rounds.
     """
     options: AdjustBundleOptions = job.options
-    reconstruction = to_reconstruction(model, keypoints, index.names.tolist())
-    pairs = _usable_pairs(view_graph, model)
+    reconstruction = _start(job, poses, index.names.tolist())
+    pairs = _usable_pairs(view_graph, poses)
     pairs = pairs[~taken[pairs].any(axis=1)]
-    graph = correspondence_graph(keypoints, *gather_inlier_matches(job.paths("geometries"), pairs))
+
+    def read_graph() -> pycolmap.CorrespondenceGraph:
+        counts = [reconstruction.image(row + 1).num_points2D() for row in range(len(index.names))]
+        return correspondence_graph(counts, *gather_inlier_matches(job.paths("geometries"), pairs))
+
     fixed = job.settings.get("intrinsics", "fixed") == "fixed"
-    held = {row for row, camera in enumerate(model.cameras) if fixed and camera.source == "given"}
-    held |= set(model.camera_ids[taken].tolist())
+    held = {row for row, camera in enumerate(poses.cameras) if fixed and camera.source == "given"}
+    held |= set(poses.camera_ids[taken].tolist())
     solving = SolverSettings(
         loss=options.loss,
         constant_cameras=frozenset(row + 1 for row in held),
@@ -126,7 +129,7 @@ def _adjust(
         function_tolerance=options.function_tolerance,
     )
     shared = options.model_dump(include=set(RoundSettings.__dataclass_fields__))
-    shared["min_track_length"] = min(options.min_track_length, max(2, int(model.registered.sum())))
+    shared["min_track_length"] = min(options.min_track_length, max(2, int(poses.registered.sum())))
     settings = RoundSettings(**shared, seed=job.seed_for("bundle"))
     refines = options.refine_keypoints
     if refines == "auto":
@@ -138,23 +141,35 @@ def _adjust(
         reported.append(replace(record, name=prefix + record.name))
         _print_record(reported[-1])
 
-    adjust_rounds(reconstruction, graph, model.cameras, solving, settings, report, source)
-    result = from_reconstruction(reconstruction, model)
+    adjust_rounds(reconstruction, read_graph, poses.cameras, solving, settings, report, source)
+    result = from_reconstruction(reconstruction, poses)
     observed = observed_keypoints(reconstruction, result.image_ids, result.keypoint_ids)
     return result, observed.astype(np.float32), reported
 
 
-def _usable_pairs(graph: ViewGraph, model: BundleModel) -> np.ndarray:
+def _start(job: StageJob, poses: BundleModel, names: list[str]) -> pycolmap.Reconstruction:
+    """The poses with the triangulated points that they see; it alone stays in memory."""
+    start = TriangulatedPoints.read(job.path("points"))
+    (keypoints,) = gather_image_columns(job.paths("features"), len(names), "keypoints")
+    model = replace(
+        poses,
+        points=start.points,
+        offsets=start.offsets,
+        image_ids=start.image_ids,
+        keypoint_ids=start.keypoint_ids,
+    )
+    return to_reconstruction(restrict_to(model, poses.registered), keypoints, names)
+
+
+def _usable_pairs(graph: ViewGraph, poses: BundleModel) -> np.ndarray:
     """Edges that the filters kept, and all edges of images that averaging left out."""
-    posed = model.registered[graph.pairs].all(axis=1)
+    posed = poses.registered[graph.pairs].all(axis=1)
     usable: np.ndarray = graph.pairs[(graph.labels == 0) | ~posed]
     return usable
 
 
 def _image_source(job: StageJob, index: ImageIndex) -> ImageSource:
     """The images in gray, scaled down; the last ones are kept, as each is read twice."""
-    import cv2
-
     from snakesfm.ingest.read import read_image
 
     options: AdjustBundleOptions = job.options
@@ -198,11 +213,10 @@ def _write(
     model: BundleModel,
     models: np.ndarray,
     observed: np.ndarray,
-    keypoints: list[np.ndarray],
-    colors: list[np.ndarray],
     records: list[RoundRecord],
 ) -> None:
-    base = np.r_[0, np.cumsum([len(k) for k in keypoints])]
+    (colors,) = gather_image_columns(job.paths("features"), len(model.camera_ids), "colors")
+    base = np.r_[0, np.cumsum([len(k) for k in colors])]
     rows = base[model.image_ids] + model.keypoint_ids
     camera_models, sizes, params, _ = cameras_to_columns(model.cameras)
     Reconstruction(

@@ -69,3 +69,28 @@ def test_the_page_holds_all_runs_and_says_what_was_not_run(tmp_path: Path) -> No
     assert "not measured" in text
     assert "1,000 images from estimate_two_view (begun, not to the end)" in text
     assert "2,000 images from extract_features;" in text
+
+
+def test_what_ran_with_other_options_is_shown_but_not_fitted(tmp_path: Path) -> None:
+    def run(images: int, cpu: float, config: list[str]) -> Measurement:
+        needs = {stage: StageNeed(1, cpu, cpu, cpu, 100.0) for stage in ("build_tracks", "adjust_bundle")}
+        return Measurement(
+            "aerial", images, 4, "estimate_two_view", 10 * images, config=config, stages=needs
+        )
+
+    other = "adjust_bundle={final_observations: 1000}"
+    write_report(
+        [run(1000, 10.0, []), run(2000, 20.0, []), run(4000, 160.0, [other])],
+        tmp_path / "page.md",
+        "a command",
+    )
+    lines = (tmp_path / "page.md").read_text().splitlines()
+    assert any(line.startswith("| 4,000 ") and line.endswith(f"| `{other}` |") for line in lines)
+    tracks, bundle = (
+        next(line for line in lines if line.startswith(f"| `{stage}` | 10.0 s"))
+        for stage in ("build_tracks", "adjust_bundle")
+    )
+    assert "| 160.0 s, 100 MB |" in tracks
+    assert tracks.endswith("| 10.0 / 10.0 / 40.0 ms per image | 2.00 |")
+    assert "| 160.0 s, 100 MB * |" in bundle
+    assert bundle.endswith("| 10.0 / 10.0 ms per image | 1.00 |")

@@ -39,7 +39,9 @@ def adjusted(solving=None, **changes):
     reconstruction = to_reconstruction(model, made.keypoints, [f"{k}.jpg" for k in range(12)])
     rounds.adjust_rounds(
         reconstruction,
-        correspondence_graph(made.keypoints, made.pairs, made.match_offsets, made.matches),
+        lambda: correspondence_graph(
+            [len(k) for k in made.keypoints], made.pairs, made.match_offsets, made.matches
+        ),
         model.cameras,
         solving or SolverSettings(),
         rounds.RoundSettings(thresholds_px=(20.0, 5.0, 3.0), **changes),

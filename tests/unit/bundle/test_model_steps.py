@@ -52,7 +52,9 @@ def model_of(made, left_out=(), keep=None):
 
 
 def graph_of(made):
-    return correspondence_graph(made.keypoints, made.pairs, made.match_offsets, made.matches)
+    return correspondence_graph(
+        [len(k) for k in made.keypoints], made.pairs, made.match_offsets, made.matches
+    )
 
 
 def errors_px(model, made):
@@ -179,7 +181,7 @@ def test_left_out_image_is_registered_and_a_stranger_is_not():
     for side in (0, 1):
         rows = made.pairs[pair_of, side] == 7
         strange[rows, side] = rng.integers(0, len(made.keypoints[7]), rows.sum())
-    graph = correspondence_graph(made.keypoints, made.pairs, made.match_offsets, strange)
+    graph = correspondence_graph([len(k) for k in made.keypoints], made.pairs, made.match_offsets, strange)
     assert register_left_out(reconstruction, graph, 6.0, 15, 0.25, 0) == [4]
     pose = reconstruction.image(5).cam_from_world()
     assert np.degrees(angle_of(pose.rotation.matrix().T @ made.rotations[4])) < 0.3
@@ -207,7 +209,7 @@ def run_rounds(made, model, **changes):
     records = []
     adjust_rounds(
         reconstruction,
-        graph_of(made),
+        lambda: graph_of(made),
         model.cameras,
         SolverSettings(constant_cameras=frozenset([1])),
         RoundSettings(**changes),

@@ -33,10 +33,14 @@ def refined(camera, noise_px=0.1, points=1000, per_image=False, held=frozenset()
         made.track_keypoint_ids,
     )
     reconstruction = to_reconstruction(model, made.keypoints, [f"{k}.jpg" for k in range(12)])
-    graph = correspondence_graph(made.keypoints, made.pairs, made.match_offsets, made.matches)
+    graph = correspondence_graph(
+        [len(k) for k in made.keypoints], made.pairs, made.match_offsets, made.matches
+    )
     records = []
     solving = SolverSettings(constant_cameras=held)
-    adjust_rounds(reconstruction, graph, model.cameras, solving, RoundSettings(**changes), records.append)
+    adjust_rounds(
+        reconstruction, lambda: graph, model.cameras, solving, RoundSettings(**changes), records.append
+    )
     found = from_reconstruction(reconstruction, model).cameras
     return np.array([camera.params for camera in found]), [record.name for record in records]
 
