@@ -6,7 +6,7 @@ import importlib
 import re
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, create_model, model_validator
 
@@ -110,6 +110,8 @@ class RunOptions(BaseModel):
     """Folder (or one file) of weights, filled by 'snakemake fetch_weights'; jobs never download."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """Where networks run: on a CUDA device if there is one, on the processor, or on CUDA or not at all."""
+    batch_size: Annotated[int, Field(ge=1, le=256)] | Literal["auto"] = "auto"
+    """Images or pairs that a network gets at once; 'auto': 1 on the processor, 4 on CUDA."""
     scenes: dict[str, SceneInputs] = Field(default_factory=dict)
     """Several scenes: a mapping from name to images, reference, cameras, intrinsics and pairs."""
     seed: int = Field(default=0, ge=0)
