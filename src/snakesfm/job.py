@@ -23,7 +23,8 @@ class Call:
     ----------
     stage : verb_noun name of the stage.
     params : ``options``, ``stage_version``, ``settings`` and ``seed``.
-    files : ``scene``, ``inputs`` by name, ``outputs``, and ``upstream``: options digests of what is read.
+    files : ``scene``, ``inputs`` by name, ``outputs``, ``upstream``: options digests of what is read, and
+        ``batch_size``: how many images or pairs a network gets at once.
     threads : how many threads may be used.
     log : the job's log.
     """
@@ -122,6 +123,7 @@ def _bind(call: Call, terminal: Any) -> Any:
         threads=call.threads,
         former=former if former.is_file() else None,
         upstream=call.files["upstream"],
+        batch_size=call.files["batch_size"],
     )
 
 

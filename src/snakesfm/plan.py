@@ -280,7 +280,10 @@ class ScenePlan:
     def load(self, stage: str) -> Load:
         """What one job of a stage works on, on average over the blocks or tiles."""
         networks = len(self.models(stage))
-        return job_load(stage, self.image_count, self.blocks, self.pair_count, networks)
+        # a CUDA device holds its batches in memory of its own
+        wanted = 1 if self.configuration.device == "cuda" else self.configuration.batch_size
+        batch = 1 if wanted == "auto" else wanted
+        return job_load(stage, self.image_count, self.blocks, self.pair_count, networks, batch)
 
     def final_files(self) -> list[str]:
         """What a person looks at: the scene's model, its metrics and its report."""

@@ -21,11 +21,13 @@ class Load:
     ----------
     images, pairs : number of images and of pairs of images.
     networks : number of networks that are run on each.
+    batch : how many images or pairs a network holds in the job's memory at once.
     """
 
     images: float
     pairs: float
     networks: int = 0
+    batch: int = 1
 
 
 @dataclass(frozen=True)
@@ -73,26 +75,27 @@ NEEDS = {
 }
 
 
-# what a network takes beside, on a processor: LoFTR took 1.3 GB and 8.4 s per pair of 840 x 632
+# what a network takes beside, on a processor: LoFTR took 1.3 GB and 8.4 s per pair of 840 x 632, and DISK
+# 2.0 GB more for every further image of 1140 x 760 in a batch
 NETWORK_MB, NETWORK_IMAGE_S, NETWORK_PAIR_S = 2600, 10.0, 17.0
 
 
-def job_load(stage: str, images: int, blocks: int, pairs: int, networks: int = 0) -> Load:
+def job_load(stage: str, images: int, blocks: int, pairs: int, networks: int = 0, batch: int = 1) -> Load:
     """What one job of a stage works on, on average over the scene's blocks or tiles."""
     grain = NEEDS[stage].grain
     if grain == "block":
-        return Load(images / blocks, 0, networks)
+        return Load(images / blocks, 0, networks, batch)
     if grain == "tile":
         tiles = blocks * (blocks + 1) / 2
-        return Load(min(2 / blocks, 1) * images, pairs / tiles, networks)
-    return Load(images, pairs, networks)
+        return Load(min(2 / blocks, 1) * images, pairs / tiles, networks, batch)
+    return Load(images, pairs, networks, batch)
 
 
 def memory_mb(stage: str, load: Load, attempt: int = 1) -> int:
     """Megabytes that a stage's job asks for; each further attempt asks for twice as much."""
     need = NEEDS[stage]
     own = need.constant_mb + need.image_mb * load.images + need.pair_mb * load.pairs
-    own += NETWORK_MB * load.networks
+    own += NETWORK_MB * load.networks * load.batch
     return 100 * math.ceil((AROUND_MB + own) / 100) << (attempt - 1)
 
 

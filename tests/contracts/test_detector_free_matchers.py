@@ -95,6 +95,19 @@ class TestLoftr(DetectorFreeContract):
         coordinates, _ = self.match(matcher, pictures[0], pictures[2])
         np.testing.assert_allclose(coordinates[:, :2] % 8, 0, atol=1e-4)
 
+    def test_a_batch_gives_what_pairs_alone_give_in_any_order(self, matcher, pictures):
+        # random networks find most in an image and its copy
+        rows = [(0, 0), (0, 1), (2, 2), (0, 3), (1, 1)]
+        pictures = [*pictures, picture(np.zeros((96, 128), np.uint8), "black")]
+        prepared = [(matcher.prepare(pictures[i]), matcher.prepare_second(pictures[j])) for i, j in rows]
+        apart = [matcher.match(*pair) for pair in prepared]
+        assert [len(coordinates) > 5 for coordinates, _ in apart] == [True, True, True, False, True]
+        for order in ([0, 1, 2, 3, 4], [3, 4, 2, 0, 1]):
+            together = matcher.match_batch([prepared[row] for row in order])
+            for row, (coordinates, scores) in zip(order, together, strict=True):
+                np.testing.assert_allclose(coordinates, apart[row][0], atol=2e-3)
+                np.testing.assert_allclose(scores, apart[row][1], rtol=1e-3, atol=1e-6)
+
 
 class TestVirtualPlaces(DetectorFreeContract):
     method = "virtual_places"

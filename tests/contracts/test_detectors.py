@@ -38,6 +38,11 @@ def shapes(width=320, height=240, seed=3):
     return gray, np.repeat(gray[..., None], 3, axis=2)
 
 
+def extract(detector, gray, rgb, max_keypoints, max_shorter_side_px):
+    """The keypoints of one image."""
+    return extract_keypoints(detector, [(gray, rgb)], max_keypoints, max_shorter_side_px)[0]
+
+
 class DetectorContract:
     """Inherit, set ``method`` and, where blobs are not what it detects, ``picture``."""
 
@@ -54,7 +59,7 @@ class DetectorContract:
 
     def test_finds_what_is_there(self, detector):
         gray, rgb = self.picture()
-        found = extract_keypoints(detector, gray, rgb, 5000, 760)
+        found = extract(detector, gray, rgb, 5000, 760)
         assert 100 < len(found) <= 5000
         assert found.keypoints.dtype == np.float32 and found.keypoints.shape == (len(found), 2)
         assert found.descriptors.dtype == detector.descriptor_dtype
@@ -67,21 +72,21 @@ class DetectorContract:
 
     def test_a_budget_keeps_the_strongest(self, detector):
         gray, rgb = self.picture()
-        everything = extract_keypoints(detector, gray, rgb, 5000, 760)
-        few = extract_keypoints(detector, gray, rgb, 40, 760)
+        everything = extract(detector, gray, rgb, 5000, 760)
+        few = extract(detector, gray, rgb, 40, 760)
         assert len(few) == 40
         np.testing.assert_array_equal(few.keypoints, everything.keypoints[:40])
         np.testing.assert_array_equal(few.descriptors, everything.descriptors[:40])
 
     def test_no_place_is_there_twice(self, detector):
         gray, rgb = self.picture()
-        found = extract_keypoints(detector, gray, rgb, 5000, 760)
+        found = extract(detector, gray, rgb, 5000, 760)
         assert len(np.unique(found.keypoints, axis=0)) == len(found)
 
     @pytest.mark.parametrize("shape", [(1, 1), (5, 300), (64, 64), (240, 320)])
     def test_an_image_without_features_has_none(self, detector, shape):
         gray = np.full(shape, 128, np.uint8)
-        found = extract_keypoints(detector, gray, np.repeat(gray[..., None], 3, axis=2), 5000, 760)
+        found = extract(detector, gray, np.repeat(gray[..., None], 3, axis=2), 5000, 760)
         assert found.keypoints.shape == (0, 2)
         assert found.descriptors.shape == (0, detector.descriptor_size)
         assert found.descriptors.dtype == detector.descriptor_dtype
@@ -93,7 +98,7 @@ class DetectorContract:
         try:
             for threads in (1, 2, 1):
                 cv2.setNumThreads(threads)
-                results.append(extract_keypoints(detector, gray, rgb, 200, 760))
+                results.append(extract(detector, gray, rgb, 200, 760))
         finally:
             cv2.setNumThreads(before)
         for other in results[1:]:
@@ -113,7 +118,7 @@ class BlobDetectorContract(DetectorContract):
         gray = np.clip(image, 0, 255).astype(np.uint8)
         rgb = np.repeat(gray[..., None], 3, axis=2)
         for shorter_side in (480, 240, 171):
-            found = extract_keypoints(detector, gray, rgb, 1000, shorter_side).keypoints
+            found = extract(detector, gray, rgb, 1000, shorter_side).keypoints
             nearest = np.linalg.norm(found[None] - centers[:, None], axis=2).argmin(axis=1)
             offset = found[nearest] - centers
             seen = np.linalg.norm(offset, axis=1) < 2
@@ -131,5 +136,5 @@ class TestUprightSift(BlobDetectorContract):
     options: ClassVar[dict] = {"upright": True}
 
     def test_angles_are_zero(self, detector):
-        found = extract_keypoints(detector, *blobs(), 5000, 760)
+        found = extract(detector, *blobs(), 5000, 760)
         assert not found.angles.any()

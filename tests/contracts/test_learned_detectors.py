@@ -5,11 +5,19 @@ from typing import ClassVar
 
 import numpy as np
 import pytest
-from contracts.test_detectors import DetectorContract, shapes
+from contracts.test_detectors import DetectorContract, extract, shapes
 
 from snakesfm.errors import ConfigError
 from snakesfm.features.extraction import create_detector, extract_keypoints
 from snakesfm.learned.checkpoints import read_checkpoint
+
+
+def same_keypoints(one, other):
+    """The same keypoints to rounding."""
+    assert one.image_size == other.image_size
+    np.testing.assert_allclose(one.keypoints, other.keypoints, atol=2e-3)
+    np.testing.assert_allclose(one.scores, other.scores, rtol=1e-4, atol=1e-6)
+    np.testing.assert_allclose(one.descriptors, other.descriptors, atol=2e-3)
 
 
 class LearnedDetectorContract(DetectorContract):
@@ -27,7 +35,7 @@ class LearnedDetectorContract(DetectorContract):
         return self.detectors[self.method]
 
     def test_descriptors_are_of_unit_length(self, detector):
-        found = extract_keypoints(detector, *shapes(), 300, 760)
+        found = extract(detector, *shapes(), 300, 760)
         lengths = np.linalg.norm(found.descriptors.astype(np.float64), axis=1)
         np.testing.assert_allclose(lengths, 1, atol=2e-3)
 
@@ -50,6 +58,17 @@ class LearnedDetectorContract(DetectorContract):
             self.score_name: torch.ones(len(pixels)),
         }
         return lambda *_, **__: [SimpleNamespace(**tensors)]
+
+    def test_a_batch_gives_what_single_images_give_in_any_order(self, detector):
+        sizes = [(200, 150), (160, 224), (200, 150), (200, 150)]
+        images = [shapes(*size, seed=seed) for seed, size in enumerate(sizes)]
+        images[2] = (np.full_like(images[2][0], 9), np.full_like(images[2][1], 9))
+        apart = [extract(detector, *image, 100, 760) for image in images]
+        assert len(apart[2]) == 0 and min(len(apart[row]) for row in (0, 1, 3)) > 30
+        for order in ([0, 1, 2, 3], [3, 2, 1, 0]):
+            together = extract_keypoints(detector, [images[row] for row in order], 100, 760)
+            for row, found in zip(order, together, strict=True):
+                same_keypoints(found, apart[row])
 
     def test_random_weights_run_through(self, weights):
         found = create_detector(self.method, state=None).detect(*shapes(64, 96), 50)
@@ -114,12 +133,19 @@ class TestSuperpointOfRandomWeights(DetectorContract):
         lengths = np.linalg.norm(found.descriptors.astype(np.float64), axis=1)
         np.testing.assert_allclose(lengths, 1, atol=2e-3)
 
+    def test_a_batch_gives_what_single_images_give(self, detector):
+        images = [shapes(160, 120, seed=seed) for seed in range(3)]
+        together = extract_keypoints(detector, images, 100, 760)
+        for image, found in zip(images, together, strict=True):
+            same_keypoints(found, extract(detector, *image, 100, 760))
+            assert len(found) == 100
+
     def test_its_weights_survive_their_file(self, detector, tmp_path):
         from safetensors.torch import save_file
 
         save_file(detector._network.state_dict(), tmp_path / "superpoint.safetensors")
         again = create_detector(self.method, state=read_checkpoint(self.method, tmp_path, "fetch"))
-        one, other = (extract_keypoints(d, *shapes(), 50, 760) for d in (detector, again))
+        one, other = (extract(d, *shapes(), 50, 760) for d in (detector, again))
         np.testing.assert_array_equal(one.descriptors, other.descriptors)
         (tmp_path / "superpoint.safetensors").write_bytes(b"damaged")
         with pytest.raises(ConfigError, match="holds no weights"):

@@ -5,10 +5,10 @@ from typing import ClassVar
 import cv2
 import numpy as np
 import pytest
-from contracts.test_detectors import shapes
+from contracts.test_detectors import extract, shapes
 
 from snakesfm.errors import ConfigError
-from snakesfm.features.extraction import create_detector, extract_keypoints
+from snakesfm.features.extraction import create_detector
 from snakesfm.features.keypoints import KeypointSet
 from snakesfm.learned.checkpoints import read_checkpoint
 from snakesfm.matching.matcher import MATCHERS, create_matcher
@@ -44,8 +44,7 @@ class LearnedMatcherContract:
             # the homography maps coordinates whose first pixel's centre is (0, 0)
             pictures = [gray, cv2.warpPerspective(gray, VIEW, (400, 300)), shapes(400, 300, seed=9)[0]]
             self.made[self.detector] = [
-                extract_keypoints(detector, p, np.repeat(p[..., None], 3, axis=2), 250, 760)
-                for p in pictures
+                extract(detector, p, np.repeat(p[..., None], 3, axis=2), 250, 760) for p in pictures
             ]
         return self.made[self.detector]
 
@@ -119,6 +118,28 @@ class TestXfeatLighterglue(LearnedMatcherContract):
     method = "lightglue"
     detector = "xfeat"
     median_error_px = 1.8
+
+
+def test_superglue_gives_in_a_batch_what_it_gives_alone_in_any_order():
+    torch = pytest.importorskip("torch", reason="the extra 'deep' is not installed")
+    pytest.importorskip("transformers", reason="the extra 'deep' is not installed")
+    torch.manual_seed(0)
+    matcher = create_matcher("superglue", detector="superpoint", min_score=0.0, state=None)
+    counts = [(40, 25), (30, 40), (1, 40), (40, 40), (20, 20), (0, 5)]
+    pairs = [
+        tuple(
+            matcher.prepare(TestSuperpointMatchersOfRandomWeights.points(count, 2 * row + side))
+            for side, count in enumerate(pair)
+        )
+        for row, pair in enumerate(counts)
+    ]
+    apart = [matcher.match(*pair) for pair in pairs]
+    assert [len(matches) > 5 for matches, _ in apart] == [True, True, False, True, True, False]
+    for order in ([0, 1, 2, 3, 4, 5], [5, 3, 1, 4, 2, 0]):
+        together = matcher.match_batch([pairs[row] for row in order])
+        for row, (matches, scores) in zip(order, together, strict=True):
+            np.testing.assert_array_equal(matches, apart[row][0])
+            np.testing.assert_allclose(scores, apart[row][1], rtol=1e-3, atol=1e-6)
 
 
 @pytest.mark.parametrize("method", ["lightglue", "superglue"])

@@ -97,6 +97,20 @@ def test_other_weights_change_the_params(tmp_path: Path) -> None:
     assert before != params()
 
 
+def test_the_size_of_batches_changes_what_a_job_asks_for_but_no_params(tmp_path: Path) -> None:
+    scenes = []
+    for config in ({}, {"batch_size": 4}, {"batch_size": 4, "device": "cuda"}):
+        plan = plan_of(tmp_path, front_end="superpoint+superglue", **config)
+        scenes += plan.scenes.values()
+    stages = {"extract_features": {"block": "0"}, "match_pairs": {"tile": "0-0"}}
+    for stage, wildcards in stages.items():
+        assert scenes[0].params(stage, wildcards, True) == scenes[1].params(stage, wildcards, True)
+        assert [scene.load(stage).batch for scene in scenes] == [1, 4, 1]
+    for wrong in (0, 257, "many"):
+        with pytest.raises(ConfigError, match="batch_size"):
+            plan_of(tmp_path, batch_size=wrong)
+
+
 def test_exact_keypoints_are_not_refined_in_the_images(tmp_path: Path) -> None:
     for front_end, refined in (("virtual", False), ("sift", "auto")):
         plan = plan_of(tmp_path, front_end=front_end, reference=str(tmp_path))

@@ -52,3 +52,4 @@ def test_a_network_asks_for_more() -> None:
         without, with_one = (job_load(stage, 40, 2, pairs, networks) for networks in (0, 1))
         assert memory_mb(stage, with_one) == memory_mb(stage, without) + 2600
         assert 1 < runtime_min(stage, with_one) - runtime_min(stage, without) < 60
+        assert memory_mb(stage, job_load(stage, 40, 2, pairs, 1, 3)) == memory_mb(stage, without) + 7800

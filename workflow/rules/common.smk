@@ -162,7 +162,10 @@ def gpus(stage):
 
 
 def job_files():
-    """A params function: the JSON that tells a job its scene and files; Snakemake tracks it by the files alone."""
+    """A params function: the JSON of a job's scene and files, and of what no result depends on.
+
+    Snakemake tracks it by the files alone.
+    """
 
     def render(wildcards, input, output):
         call = {
@@ -173,6 +176,7 @@ def job_files():
             },
             "outputs": list(output)[:MOST_LISTED_OUTPUTS],
             "upstream": PLAN.scenes[wildcards.scene].upstream(input),
+            "batch_size": PLAN.scenes[wildcards.scene].configuration.batch_size,
         }
         return json.dumps(call)
 

@@ -6,7 +6,7 @@ import importlib
 import re
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, create_model, model_validator
 
@@ -110,11 +110,13 @@ class RunOptions(BaseModel):
     """Folder (or one file) of weights, filled by 'snakemake fetch_weights'; jobs never download."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """Where networks run: on a CUDA device if there is one, on the processor, or on CUDA or not at all."""
+    batch_size: Annotated[int, Field(ge=1, le=256)] | Literal["auto"] = "auto"
+    """Images or pairs that a network gets at once; 'auto': 1 on the processor, 4 on CUDA."""
     scenes: dict[str, SceneInputs] = Field(default_factory=dict)
     """Several scenes: a mapping from name to images, reference, cameras, intrinsics and pairs."""
     seed: int = Field(default=0, ge=0)
     """Seed of every random draw; the same seed gives the same model."""
-    blocks: int | Literal["auto"] = "auto"
+    blocks: Annotated[int, Field(ge=1)] | Literal["auto"] = "auto"
     """Blocks that the images are dealt into; B blocks give B(B+1)/2 tiles of pairs, the unit of work."""
 
     @model_validator(mode="before")
@@ -137,12 +139,6 @@ class RunOptions(BaseModel):
             if values.get("scenes") is None and "scenes" in values:
                 values = {**values, "scenes": {}}
         return values
-
-    @model_validator(mode="after")
-    def _check_blocks(self) -> "RunOptions":
-        if isinstance(self.blocks, int) and self.blocks < 1:
-            raise ValueError("must be 'auto' or a number of at least 1")
-        return self
 
 
 @functools.cache
@@ -175,8 +171,10 @@ def load_configuration(values: Mapping[str, Any]) -> RunOptions:
 
 def _one_sentence(cls: type[BaseModel], error: ValidationError) -> str:
     """The first problem in one sentence that names the key and the remedy."""
-    first = error.errors()[0]
+    first, *others = error.errors()
     path = [str(part) for part in first["loc"] if not str(part).startswith("function-")]
+    # what follows the option's name is pydantic's name of one of several types
+    path = path[: {"scenes": 3}.get(path[0], 2 if path[0] in STAGES else 1)]
     key = ".".join(path)
     if first["type"] == "extra_forbidden":
         known = _keys_beside(cls, path)
@@ -185,7 +183,13 @@ def _one_sentence(cls: type[BaseModel], error: ValidationError) -> str:
         return f"Unknown configuration key '{key}': {hint}?" if nearest else f"Unknown key '{key}': {hint}."
     message = first["msg"].removeprefix("Value error, ")
     message = re.sub(r"^Input", "the value", message)
-    return f"Configuration key '{key}' = {first['input']!r}: {message[:1].lower() + message[1:]}."
+    words = [
+        f" (or {other['ctx']['expected']})"
+        for other in others
+        if other["type"] == "literal_error" and other["loc"][:-1] == first["loc"][:-1]
+    ]
+    message = message[:1].lower() + message[1:] + "".join(words)
+    return f"Configuration key '{key}' = {first['input']!r}: {message}."
 
 
 def _keys_beside(cls: type[BaseModel], path: list[str]) -> list[str]:

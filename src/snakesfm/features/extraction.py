@@ -1,7 +1,7 @@
 """From an image to its strongest keypoints."""
 
 import importlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from snakesfm.features.keypoints import Detector, KeypointSet
+from snakesfm.features.keypoints import BatchDetector, Detector, KeypointSet
 from snakesfm.features.sift import SiftDetector
 
 Array = NDArray[Any]
@@ -41,29 +41,44 @@ def create_detector(method: str, **options: Any) -> Detector:
 
 
 def extract_keypoints(
-    detector: Detector, gray: Array, rgb: Array, max_keypoints: int, max_shorter_side_px: int
-) -> KeypointSet:
-    """Find the strongest keypoints of an image.
+    detector: Detector,
+    images: Sequence[tuple[Array, Array]],
+    max_keypoints: int,
+    max_shorter_side_px: int,
+) -> list[KeypointSet]:
+    """Find the strongest keypoints of images.
 
     Parameters
     ----------
     detector : what finds and describes them.
-    gray, rgb : (H,W) and (H,W,3) uint8, the image, whose pixels are those of the result.
-    max_keypoints : most keypoints returned.
+    images : gray (H,W) and rgb (H,W,3) uint8 of each, whose pixels are those of the result.
+    max_keypoints : most keypoints returned of each.
     max_shorter_side_px : larger images are scaled down to this before detection.
 
     Returns
     -------
-    At most ``max_keypoints`` keypoints in the image's pixels, strongest first; ties are ordered by place,
-    scale and angle, so the order depends on the image alone.
+    Of each image at most ``max_keypoints`` keypoints in its pixels, strongest first; ties are ordered by
+    place, scale and angle, so the order depends on the image alone.
     """
-    height, width = gray.shape
-    small_gray, small_rgb = _shrink(gray, rgb, max_shorter_side_px)
-    found = detector.detect(small_gray, small_rgb, max_keypoints)
+    small = [_shrink(gray, rgb, max_shorter_side_px) for gray, rgb in images]
+    if isinstance(detector, BatchDetector):
+        found = detector.detect_batch(small, max_keypoints)
+    else:
+        found = [detector.detect(gray, rgb, max_keypoints) for gray, rgb in small]
+    return [
+        _strongest(points, max_keypoints, seen[0].shape, original[0].shape)
+        for points, seen, original in zip(found, small, images, strict=True)
+    ]
+
+
+def _strongest(
+    found: KeypointSet, count: int, shape: tuple[int, ...], original: tuple[int, ...]
+) -> KeypointSet:
+    """The strongest keypoints of an image (H,W), in the pixels of the original (H,W)."""
     x, y = found.keypoints[:, 0], found.keypoints[:, 1]
-    found = found.take(np.lexsort((found.angles, found.scales, x, y, -found.scores))[:max_keypoints])
-    found = replace(found, image_size=small_gray.shape[::-1])
-    return found.scaled(width / small_gray.shape[1], height / small_gray.shape[0])
+    found = found.take(np.lexsort((found.angles, found.scales, x, y, -found.scores))[:count])
+    found = replace(found, image_size=(shape[1], shape[0]))
+    return found.scaled(original[1] / shape[1], original[0] / shape[0])
 
 
 def _shrink(gray: Array, rgb: Array, max_shorter_side_px: int) -> tuple[Array, Array]:

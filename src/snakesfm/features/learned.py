@@ -1,12 +1,13 @@
 """Detectors that are networks: ALIKED, DISK and XFeat by kornia, SuperPoint by transformers."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from snakesfm.features.keypoints import KeypointSet
+from snakesfm.learned.batches import equal_rows
 from snakesfm.learned.checkpoints import fill_network
 from snakesfm.learned.device import load_torch
 from snakesfm.learned.pictures import to_array, to_tensor
@@ -16,6 +17,8 @@ Array = NDArray[Any]
 SMALLEST_SIDE_PX = 32
 # networks put the first pixel's centre at (0, 0)
 CENTER_SHIFT = 0.5
+# places (N,2) float32 in pixels, and tensors: descriptors (N,D) and scores (N,)
+Inferred = tuple[Array, Any, Any]
 
 
 class LearnedDetector:
@@ -31,21 +34,33 @@ class LearnedDetector:
 
     def detect(self, gray: Array, rgb: Array, max_keypoints: int) -> KeypointSet:
         """See :class:`snakesfm.features.keypoints.Detector`."""
-        if min(gray.shape) < SMALLEST_SIDE_PX or gray.min() == gray.max():
-            return KeypointSet.empty(self.descriptor_size, self.descriptor_dtype)
-        with load_torch().inference_mode():
-            places, descriptors, scores = self._infer(gray, rgb, max_keypoints)
-        count = len(places)
-        return KeypointSet(
-            places,
-            to_array(descriptors, np.float16),
-            to_array(scores, np.float32),
-            np.ones(count, np.float32),
-            np.zeros(count, np.float32),
-        )
+        return self.detect_batch([(gray, rgb)], max_keypoints)[0]
 
-    def _infer(self, gray: Array, rgb: Array, max_keypoints: int) -> tuple[Array, Any, Any]:
-        """Places (N,2) float32 in pixels, and tensors: descriptors (N,D) and scores (N,)."""
+    def detect_batch(self, images: Sequence[tuple[Array, Array]], max_keypoints: int) -> list[KeypointSet]:
+        """See :class:`snakesfm.features.keypoints.BatchDetector`."""
+        found = [KeypointSet.empty(self.descriptor_size, self.descriptor_dtype)] * len(images)
+        shown = [
+            row
+            for row, (gray, _) in enumerate(images)
+            if min(gray.shape) >= SMALLEST_SIDE_PX and gray.min() != gray.max()
+        ]
+        for same in equal_rows([images[row][0].shape for row in shown]):
+            rows = [shown[part] for part in same]
+            grays, rgbs = ([images[row][part] for row in rows] for part in (0, 1))
+            with load_torch().inference_mode():
+                inferred = self._infer(grays, rgbs, max_keypoints)
+            for row, (places, descriptors, scores) in zip(rows, inferred, strict=True):
+                found[row] = KeypointSet(
+                    places,
+                    to_array(descriptors, np.float16),
+                    to_array(scores, np.float32),
+                    np.ones(len(places), np.float32),
+                    np.zeros(len(places), np.float32),
+                )
+        return found
+
+    def _infer(self, grays: Sequence[Array], rgbs: Sequence[Array], max_keypoints: int) -> list[Inferred]:
+        """What the network finds in images of one shape."""
         raise NotImplementedError
 
 
@@ -66,12 +81,14 @@ class AlikedDetector(LearnedDetector):
         network = ALIKED("aliked-n16", detection_threshold=self.threshold)
         self._network = fill_network(network, state, "ALIKED", ("hw_grid",))
 
-    def _infer(self, gray: Array, rgb: Array, max_keypoints: int) -> tuple[Array, Any, Any]:
-        (found,) = self._network(to_tensor(rgb))
-        # without any score above the threshold the network falls back on the mean score
-        kept = found.keypoint_scores > self.threshold
-        places = to_array(found.keypoints[kept], np.float32) + np.float32(CENTER_SHIFT)
-        return places, found.descriptors[kept], found.keypoint_scores[kept]
+    def _infer(self, grays: Sequence[Array], rgbs: Sequence[Array], max_keypoints: int) -> list[Inferred]:
+        inferred = []
+        for found in self._network(to_tensor(rgbs)):
+            # without any score above the threshold the network falls back on the mean score
+            kept = found.keypoint_scores > self.threshold
+            places = to_array(found.keypoints[kept], np.float32) + np.float32(CENTER_SHIFT)
+            inferred.append((places, found.descriptors[kept], found.keypoint_scores[kept]))
+        return inferred
 
 
 class DiskDetector(LearnedDetector):
@@ -89,10 +106,12 @@ class DiskDetector(LearnedDetector):
 
         self._network = fill_network(DISK(self.descriptor_size), state, "DISK")
 
-    def _infer(self, gray: Array, rgb: Array, max_keypoints: int) -> tuple[Array, Any, Any]:
-        (found,) = self._network(to_tensor(rgb), n=max_keypoints, pad_if_not_divisible=True)
-        places = to_array(found.keypoints, np.float32) + np.float32(CENTER_SHIFT)
-        return places, found.descriptors, found.detection_scores
+    def _infer(self, grays: Sequence[Array], rgbs: Sequence[Array], max_keypoints: int) -> list[Inferred]:
+        inferred = []
+        for found in self._network(to_tensor(rgbs), n=max_keypoints, pad_if_not_divisible=True):
+            places = to_array(found.keypoints, np.float32) + np.float32(CENTER_SHIFT)
+            inferred.append((places, found.descriptors, found.detection_scores))
+        return inferred
 
 
 class XfeatDetector(LearnedDetector):
@@ -112,13 +131,15 @@ class XfeatDetector(LearnedDetector):
         self._network = XFeat().to("cpu")
         self._network.net = fill_network(self._network.net, state, "XFeat")
 
-    def _infer(self, gray: Array, rgb: Array, max_keypoints: int) -> tuple[Array, Any, Any]:
-        (found,) = self._network.detectAndCompute(to_tensor(rgb), top_k=max_keypoints)
+    def _infer(self, grays: Sequence[Array], rgbs: Sequence[Array], max_keypoints: int) -> list[Inferred]:
         # whole pixels of the image that the network resized: their centres are half of such a pixel farther
-        sides = np.array(gray.shape[::-1])
+        sides = np.array(grays[0].shape[::-1])
         ratio = sides / (sides // self.multiple * self.multiple)
-        places = to_array(found["keypoints"], np.float64) + CENTER_SHIFT * ratio
-        return places.astype(np.float32), found["descriptors"], found["scores"]
+        inferred = []
+        for found in self._network.detectAndCompute(to_tensor(rgbs), top_k=max_keypoints):
+            places = to_array(found["keypoints"], np.float64) + CENTER_SHIFT * ratio
+            inferred.append((places.astype(np.float32), found["descriptors"], found["scores"]))
+        return inferred
 
 
 class SuperpointDetector(LearnedDetector):
@@ -138,10 +159,13 @@ class SuperpointDetector(LearnedDetector):
         network = SuperPointForKeypointDetection(SuperPointConfig())
         self._network = fill_network(network, state, "SuperPoint")
 
-    def _infer(self, gray: Array, rgb: Array, max_keypoints: int) -> tuple[Array, Any, Any]:
+    def _infer(self, grays: Sequence[Array], rgbs: Sequence[Array], max_keypoints: int) -> list[Inferred]:
         # the encoder halves the image three times and leaves out what is over
-        height, width = (side // self.stride * self.stride for side in gray.shape)
-        encoded = self._network.encoder(to_tensor(gray[:height, :width]))[0]
-        places, scores = self._network.keypoint_decoder(encoded)
-        descriptors = self._network.descriptor_decoder(encoded, places)
-        return to_array(places, np.float32) + np.float32(CENTER_SHIFT), descriptors, scores
+        height, width = (side // self.stride * self.stride for side in grays[0].shape)
+        inferred = []
+        # the decoders look at the first image of a batch alone
+        for encoded in self._network.encoder(to_tensor([gray[:height, :width] for gray in grays]))[0]:
+            places, scores = self._network.keypoint_decoder(encoded[None])
+            descriptors = self._network.descriptor_decoder(encoded[None], places)
+            inferred.append((to_array(places, np.float32) + np.float32(CENTER_SHIFT), descriptors, scores))
+        return inferred

@@ -1,5 +1,6 @@
 """Images as tensors."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -10,11 +11,20 @@ from snakesfm.learned.device import choose_device, load_torch
 Array = NDArray[Any]
 
 
-def to_tensor(pixels: Array) -> Any:
-    """An image (H,W) or (H,W,3) uint8 as (1,1,H,W) or (1,3,H,W) float32 in 0 .. 1, on the chosen device."""
+def to_tensor(images: Sequence[Array]) -> Any:
+    """Images of one shape as a batch on the chosen device.
+
+    Parameters
+    ----------
+    images : B images, (H,W) or (H,W,3) uint8.
+
+    Returns
+    -------
+    (B,1,H,W) or (B,3,H,W) float32 in 0 .. 1.
+    """
     torch = load_torch()
-    planes = pixels[None] if pixels.ndim == 2 else pixels.transpose(2, 0, 1)
-    return torch.from_numpy(np.ascontiguousarray(planes[None])).to(choose_device()).float() / 255
+    planes = [image[None] if image.ndim == 2 else image.transpose(2, 0, 1) for image in images]
+    return torch.from_numpy(np.stack(planes)).to(choose_device()).float() / 255
 
 
 def to_array(tensor: Any, dtype: Any) -> Array:

@@ -34,7 +34,8 @@ NETWORKS: dict[str, dict[str, Any]] = {
 class LightglueMatcher:
     """LightGlue with early exit and pruning, one pair at a time: its matches depend on the pair alone.
 
-    On CUDA the attention runs in half precision.
+    A batch would go on until its last pair is sure, and what is pruned differs from pair to pair. On CUDA
+    the attention runs in half precision.
 
     Parameters
     ----------

@@ -1,13 +1,14 @@
 """LoFTR (Sun et al. 2021), by kornia: a network that matches images without keypoints."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from snakesfm.learned.batches import equal_rows
 from snakesfm.learned.checkpoints import fill_network
 from snakesfm.learned.device import load_torch
 from snakesfm.learned.pictures import to_array, to_tensor
@@ -73,26 +74,57 @@ class LoftrMatcher:
     def prepare(self, first: Picture) -> PreparedPicture:
         """See :class:`snakesfm.matching.detector_free.DetectorFreeMatcher`."""
         small = self.prepare_second(first)
-        return small if small.gray is None else PreparedPicture(small.gray, small.ratios, self._see(small))
+        return small if small.gray is None else replace(small, features=self._see([small]))
 
     def prepare_second(self, second: Picture) -> PreparedPicture:
         """See :class:`snakesfm.matching.detector_free.DetectorFreeMatcher`."""
         return shrink(second, self._longer_side_px, self.multiple)
 
-    def _see(self, picture: PreparedPicture) -> Any:
-        assert picture.gray is not None
+    def _see(self, pictures: Sequence[PreparedPicture]) -> Any:
+        grays = [picture.gray for picture in pictures if picture.gray is not None]
         with load_torch().inference_mode():
-            return self._network.extract_features(to_tensor(picture.gray))
+            return self._network.extract_features(to_tensor(grays))
 
     def match(self, first: PreparedPicture, second: PreparedPicture) -> tuple[Array, Array]:
         """See :class:`snakesfm.matching.detector_free.DetectorFreeMatcher`."""
-        if first.gray is None or second.gray is None:
-            return no_coordinates()
-        with load_torch().inference_mode():
-            found = self._network({"features0": first.features, "features1": self._see(second)})
-        one = to_array(found["keypoints0"], np.float64) * first.ratios
-        other = to_array(found["keypoints1"], np.float64) * second.ratios
-        return _inside(one, other, to_array(found["confidence"], np.float32), first, second)
+        return self.match_batch([(first, second)])[0]
+
+    def match_batch(
+        self, pairs: Sequence[tuple[PreparedPicture, PreparedPicture]]
+    ) -> list[tuple[Array, Array]]:
+        """See :class:`snakesfm.matching.matcher.BatchMatcher`."""
+        results = [no_coordinates()] * len(pairs)
+        shapes = [
+            None if first.gray is None or second.gray is None else (first.gray.shape, second.gray.shape)
+            for first, second in pairs
+        ]
+        for rows in equal_rows(shapes):
+            if shapes[rows[0]] is not None:
+                matched = self._match_equal([pairs[row] for row in rows])
+                for row, result in zip(rows, matched, strict=True):
+                    results[row] = result
+        return results
+
+    def _match_equal(
+        self, pairs: Sequence[tuple[PreparedPicture, PreparedPicture]]
+    ) -> list[tuple[Array, Array]]:
+        """Match pairs of which all first images are of one shape, and all second ones."""
+        torch = load_torch()
+        with torch.inference_mode():
+            first = {
+                name: torch.cat([one.features[name] for one, _ in pairs]) for name in pairs[0][0].features
+            }
+            second = self._see([other for _, other in pairs])
+            found = self._network({"features0": first, "features1": second})
+        numbers = found["batch_indexes"].cpu().numpy()
+        places = [to_array(found[name], np.float64) for name in ("keypoints0", "keypoints1")]
+        scores = to_array(found["confidence"], np.float32)
+        results = []
+        for number, (one, other) in enumerate(pairs):
+            own = numbers == number
+            ends = (places[0][own] * one.ratios, places[1][own] * other.ratios)
+            results.append(_inside(*ends, scores[own], one, other))
+        return results
 
 
 def _inside(

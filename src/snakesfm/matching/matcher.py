@@ -1,9 +1,9 @@
 """The interface of what matches two images."""
 
 import importlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, Protocol
+from typing import Any, Literal, Protocol, runtime_checkable
 
 from numpy.typing import NDArray
 
@@ -33,6 +33,14 @@ class Matcher(Protocol):
         matches : (K,2) int32 rows of ``first`` and ``second``, ascending, each row at most once.
         scores : (K,) float32 in 0 .. 1, larger is better.
         """
+
+
+@runtime_checkable
+class BatchMatcher(Protocol):
+    """A matcher, with keypoints or without, that is quicker on several pairs at once."""
+
+    def match_batch(self, pairs: Sequence[tuple[Any, Any]]) -> list[tuple[Array, Array]]:
+        """What ``match`` finds in each pair of prepared images, to rounding; like pairs share work."""
 
 
 @dataclass(frozen=True)

@@ -1,12 +1,13 @@
 """The interface of networks that sum up an image in one vector."""
 
 import importlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from snakesfm.learned.batches import equal_rows
 from snakesfm.learned.device import load_torch
 from snakesfm.learned.pictures import to_array, to_tensor
 
@@ -14,7 +15,7 @@ Array = NDArray[Any]
 
 
 class GlobalDescriptor(Protocol):
-    """Describes images one by one; a new one joins by an entry in ``DESCRIPTORS``."""
+    """Describes images; a new one joins by an entry in ``DESCRIPTORS``."""
 
     @property
     def size(self) -> int:
@@ -32,32 +33,41 @@ class GlobalDescriptor(Protocol):
         """Descriptors (B,D) of images (B,3,H,W), float tensors in 0 .. 1, of any length."""
 
 
-def describe_image(descriptor: GlobalDescriptor, rgb: Array, longer_side_px: int) -> Array:
-    """The global descriptor of one image, whatever was described before.
+def describe_batch(descriptor: GlobalDescriptor, images: Sequence[Array], longer_side_px: int) -> Array:
+    """The global descriptors of images, each to rounding what it is alone.
 
     Parameters
     ----------
     descriptor : the network.
-    rgb : (H,W,3) uint8.
+    images : B images, (H,W,3) uint8 of any sizes; those that become one size share their work.
     longer_side_px : larger images are scaled down to this; both sides become multiples, at least one.
 
     Returns
     -------
-    (D,) float32 of unit length; zeros for an image of one tone, which resembles none.
+    (B,D) float32 of unit length; zeros for an image of one tone, which resembles none.
     """
+    vectors = np.zeros((len(images), descriptor.size))
+    small = [_shrink(rgb, longer_side_px, descriptor.multiple) for rgb in images]
+    for same in equal_rows([rgb.shape for rgb in small]):
+        rows = [row for row in same if images[row].min() != images[row].max()]
+        if rows:
+            with load_torch().inference_mode():
+                inferred = descriptor.infer(to_tensor([small[row] for row in rows]))
+            vectors[rows] = to_array(inferred, np.float64)
+    lengths = np.linalg.norm(vectors, axis=1, keepdims=True)
+    units: Array = (vectors / np.maximum(lengths, 1e-12)).astype(np.float32)
+    return units
+
+
+def _shrink(rgb: Array, longer_side_px: int, multiple: int) -> Array:
+    """Scale an image down to a longer side, and both sides to the nearest multiples."""
     import cv2
 
-    if rgb.min() == rgb.max():
-        return np.zeros(descriptor.size, np.float32)
     height, width = rgb.shape[:2]
-    factor, step = min(1.0, longer_side_px / max(height, width)), descriptor.multiple
-    columns, rows = (max(1, round(side * factor / step)) * step for side in (width, height))
-    small = cv2.resize(rgb, (columns, rows), interpolation=cv2.INTER_AREA)
-    with load_torch().inference_mode():
-        vector = to_array(descriptor.infer(to_tensor(small))[0], np.float64)
-    length = float(np.linalg.norm(vector))
-    unit: Array = (vector / max(length, 1e-12)).astype(np.float32)
-    return unit
+    factor = min(1.0, longer_side_px / max(height, width))
+    columns, rows = (max(1, round(side * factor / multiple)) * multiple for side in (width, height))
+    small: Array = cv2.resize(rgb, (columns, rows), interpolation=cv2.INTER_AREA)
+    return small
 
 
 def _lazy(module: str, name: str) -> Callable[..., GlobalDescriptor]:

@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 from snakesfm.artifacts.features import GlobalDescriptors, LocalFeatures, Vocabulary
 from snakesfm.artifacts.images import ImageIndex
 from snakesfm.errors import ImageError
+from snakesfm.learned.batches import in_batches
 from snakesfm.retrieval.codebook import largest_rows
-from snakesfm.retrieval.descriptor import create_descriptor, describe_image
+from snakesfm.retrieval.descriptor import create_descriptor, describe_batch
 from snakesfm.retrieval.vlad import describe_vlad
 from snakesfm.stages.job import StageJob
 
@@ -22,7 +23,7 @@ Array = NDArray[Any]
 
 
 def run(job: StageJob) -> None:
-    """Describe the images one by one and write their GlobalDescriptors."""
+    """Describe the images and write their GlobalDescriptors."""
     options: DescribeImagesOptions = job.options
     describe = _describe_local_features if options.method == "vlad" else _describe_pictures
     image_ids, described = describe(job, options)
@@ -55,13 +56,17 @@ def _describe_pictures(job: StageJob, options: "DescribeImagesOptions") -> tuple
     side = descriptor.usual_side_px if options.longer_side_px == "auto" else options.longer_side_px
     described = np.zeros((len(image_ids), descriptor.size), np.float32)
     progress = job.progress(len(image_ids), "images")
-    for row, image in enumerate(image_ids.tolist()):
-        width, height = index.sizes[image].tolist()
-        shorter = math.ceil(side * min(width, height) / max(width, height))
-        try:
-            pixels = read_image(Path(job.settings["images"]) / str(index.names[image]), shorter)
-            described[row] = describe_image(descriptor, pixels.rgb, side)
-        except ImageError as error:
-            print(f"warning: {error}")
-        progress.step()
+    for rows in in_batches([tuple(size) for size in index.sizes[image_ids].tolist()], job.network_batch()):
+        pictures = {}
+        for row in rows:
+            image = image_ids[row]
+            width, height = index.sizes[image].tolist()
+            shorter = math.ceil(side * min(width, height) / max(width, height))
+            try:
+                pixels = read_image(Path(job.settings["images"]) / str(index.names[image]), shorter)
+                pictures[row] = pixels.rgb
+            except ImageError as error:
+                print(f"warning: {error}")
+        described[list(pictures)] = describe_batch(descriptor, list(pictures.values()), side)
+        progress.step(len(rows))
     return image_ids.astype(np.int32), described

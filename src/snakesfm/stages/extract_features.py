@@ -1,7 +1,7 @@
 """Find and describe keypoints in the images of one block."""
 
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,6 +17,7 @@ from snakesfm.errors import ImageError
 from snakesfm.features.extraction import create_detector, extract_keypoints, sample_colors
 from snakesfm.features.keypoints import Detector, KeypointSet, KeypointSource
 from snakesfm.ingest.read import read_image
+from snakesfm.learned.batches import in_batches
 from snakesfm.stages.job import StageJob
 
 if TYPE_CHECKING:
@@ -37,7 +38,7 @@ REUSES_FORMER = True
 
 
 def run(job: StageJob) -> None:
-    """Read the block's images one by one and write their LocalFeatures.
+    """Read the block's images, as many at a time as a network gets at once, and write their LocalFeatures.
 
     An image that cannot be decoded gets no keypoints and a warning; the others go on.
     """
@@ -51,17 +52,18 @@ def run(job: StageJob) -> None:
     digests = [_digest(str(index.sha256[row]), options, beside) for row in rows]
     former = job.take_over(digests, _read_former)
     progress = job.progress(len(rows), "images")
-    results = []
-    for row, digest in zip(rows, digests, strict=True):
-        result = former.get(digest)
-        if result is None:
-            result = _extract(
-                folder, str(index.names[row]), tuple(index.sizes[row].tolist()), finder, options
-            )
-        results.append(result)
-        progress.step()
-    _collect(index, rows, digests, results, finder).write(job.output, job.header)
-    counts = [len(result.points) for result in results]
+    results = {place: former[digest] for place, digest in enumerate(digests) if digest in former}
+    progress.step(len(results))
+    missing = [place for place in range(len(rows)) if place not in results]
+    sizes = [(width, height) for width, height in index.sizes[rows].tolist()]
+    for batch in in_batches([sizes[place] for place in missing], job.network_batch()):
+        places = [missing[part] for part in batch]
+        images = [(str(index.names[rows[place]]), sizes[place]) for place in places]
+        results |= zip(places, _extract(folder, images, finder, options), strict=True)
+        progress.step(len(places))
+    ordered = [results[place] for place in range(len(rows))]
+    _collect(index, rows, digests, ordered, finder).write(job.output, job.header)
+    counts = [len(result.points) for result in ordered]
     reused = sum(digest in former for digest in digests)
     print(
         f"{len(rows)} images ({reused} taken over), {sum(counts)} keypoints, "
@@ -127,26 +129,35 @@ def _digest(sha256: str, options: "ExtractFeaturesOptions", beside: str) -> str:
 
 def _extract(
     folder: Path,
-    name: str,
-    size: tuple[int, int],
+    images: Sequence[tuple[str, tuple[int, int]]],
     finder: Detector | KeypointSource,
     options: "ExtractFeaturesOptions",
-) -> ColoredKeypoints:
-    try:
-        image = read_image(folder / name, options.max_shorter_side_px)
-    except ImageError as error:
-        print(f"warning: {error}")
-        nothing = KeypointSet.empty(finder.descriptor_size, finder.descriptor_dtype)
-        return ColoredKeypoints(nothing, np.zeros((0, 3), np.uint8))
+) -> list[ColoredKeypoints]:
+    """The keypoints of images, each given by its name in the folder and its width and height."""
+    nothing = KeypointSet.empty(finder.descriptor_size, finder.descriptor_dtype)
+    results = [ColoredKeypoints(nothing, np.zeros((0, 3), np.uint8))] * len(images)
+    pixels = {}
+    for place, (name, _) in enumerate(images):
+        try:
+            pixels[place] = read_image(folder / name, options.max_shorter_side_px)
+        except ImageError as error:
+            print(f"warning: {error}")
     most = finder.usual_keypoints if options.max_keypoints == "auto" else options.max_keypoints
     if isinstance(finder, KeypointSource):
-        points = finder.read(name, size)
+        found = [finder.read(*images[place]) for place in pixels]
         if options.method == "virtual":
-            points = points.take(np.argsort(-points.scores, kind="stable")[:most])
-        return ColoredKeypoints(points, sample_colors(image.rgb, points.keypoints / image.reduction))
-    points = extract_keypoints(finder, image.gray, image.rgb, most, options.max_shorter_side_px)
-    colors = sample_colors(image.rgb, points.keypoints)
-    return ColoredKeypoints(points.scaled(image.reduction, image.reduction), colors)
+            found = [points.take(np.argsort(-points.scores, kind="stable")[:most]) for points in found]
+    else:
+        seen = [(image.gray, image.rgb) for image in pixels.values()]
+        reduced = extract_keypoints(finder, seen, most, options.max_shorter_side_px)
+        found = [
+            points.scaled(image.reduction, image.reduction)
+            for points, image in zip(reduced, pixels.values(), strict=True)
+        ]
+    for (place, image), points in zip(pixels.items(), found, strict=True):
+        colors = sample_colors(image.rgb, points.keypoints / image.reduction)
+        results[place] = ColoredKeypoints(points, colors)
+    return results
 
 
 def _read_former(path: Path, wanted: set[str]) -> Mapping[str, ColoredKeypoints]:

@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any, Literal, TextIO
 
 from snakesfm.artifacts.base import Header
 from snakesfm.cache import cached_path
@@ -62,6 +62,7 @@ class StageJob:
     threads : how many threads may be used; results never depend on it.
     former : an earlier version of the output whose unchanged parts may be taken over, or None.
     upstream : per stage whose artifacts are read the digest of its version and options.
+    batch_size : how many images or pairs a network gets at once; results never depend on it.
     """
 
     stage: str
@@ -74,6 +75,7 @@ class StageJob:
     threads: int = 1
     former: Path | None = None
     upstream: Mapping[str, str] = field(default_factory=dict)
+    batch_size: int | Literal["auto"] = "auto"
 
     @property
     def output(self) -> Path:
@@ -114,6 +116,14 @@ class StageJob:
         use_threads(self.threads)
         use_device(str(self.settings.get("device", "auto")))
         return read_checkpoint(model, Path(self.settings["weights"]), self.settings["fetch"])
+
+    def network_batch(self) -> int:
+        """How many images or pairs are worked on at once: one where the stage runs no network."""
+        if not self.settings.get("models"):
+            return 1
+        from snakesfm.learned.batches import choose_batch_size
+
+        return choose_batch_size(self.batch_size)
 
     def weights_digest(self) -> str:
         """A digest of the weight files that the stage reads, for the digests of what it makes."""

@@ -25,7 +25,7 @@ from snakesfm.matching.detector_free import (
     create_detector_free,
     no_coordinates,
 )
-from snakesfm.matching.matcher import Matcher, create_matcher
+from snakesfm.matching.matcher import BatchMatcher, Matcher, create_matcher
 from snakesfm.matching.nearest import no_matches
 from snakesfm.stages.job import StageJob
 
@@ -46,7 +46,7 @@ def run(job: StageJob) -> None:
     """Match pair after pair, taking over pairs whose images and options are unchanged.
 
     Writes PairMatches, or PairCoordinates where there are no keypoints. The features (or the pictures) of
-    ``HELD_IMAGES`` images are held at a time, whatever the size of the blocks.
+    ``HELD_IMAGES`` images and of a network's batch are held at a time, whatever the size of the blocks.
     """
     options: MatchPairsOptions = job.options
     pairs = ImagePairs.read(job.path("pairs")).pairs
@@ -67,12 +67,15 @@ def run(job: StageJob) -> None:
         progress = job.progress(len(pairs) - reused, "pairs")
         read_second = functools.lru_cache(HELD_IMAGES)(lambda j: matcher.prepare_second(source.read(j)))
         held, first = -1, None
-        for row in _order(pairs, np.array([row for row in range(len(pairs)) if row not in results], int)):
-            i, j = pairs[row].tolist()
-            if i != held:
-                held, first = i, matcher.prepare(source.read(i))
-            results[row] = matcher.match(first, read_second(j))
-            progress.step()
+        missing = np.array([row for row in range(len(pairs)) if row not in results], int)
+        for rows in _batches(_order(pairs, missing), job.network_batch()):
+            prepared = []
+            for i, j in pairs[rows].tolist():
+                if i != held:
+                    held, first = i, matcher.prepare(source.read(i))
+                prepared.append((first, read_second(j)))
+            results |= zip(rows, _match(matcher, prepared), strict=True)
+            progress.step(len(rows))
     matches = [results[row] for row in range(len(pairs))]
     _collect(kind, pairs, digests, matches).write(job.output, job.header)
     counts = [len(rows) for rows, _ in matches]
@@ -80,6 +83,17 @@ def run(job: StageJob) -> None:
         f"{len(pairs)} pairs ({reused} taken over), {sum(counts)} matches, "
         f"median {int(np.median(counts)) if counts else 0} per pair, {counts.count(0)} pairs without any"
     )
+
+
+def _match(matcher: Any, prepared: list[tuple[Any, Any]]) -> list[Matches]:
+    """The matches of pairs of prepared images, together where the matcher can."""
+    if isinstance(matcher, BatchMatcher):
+        return matcher.match_batch(prepared)
+    return [matcher.match(first, second) for first, second in prepared]
+
+
+def _batches(rows: list[int], size: int) -> list[list[int]]:
+    return [rows[start : start + size] for start in range(0, len(rows), size)]
 
 
 def _create_matcher(job: StageJob, options: "MatchPairsOptions") -> Matcher:

@@ -32,6 +32,7 @@ def test_processor_time_and_memory_of_children_count(tmp_path: Path) -> None:
     ("code", "limit_s", "reason"),
     [
         ("raise SystemExit('no /some/where/model was found')", 60.0, "failed: no model was found"),
+        ("print('snakesfm: scene a failed: no pairs.'); exit('job failed')", 60.0, "failed: no pairs."),
         ("import os; os.kill(os.getpid(), 11)", 60.0, "crashed by SIGSEGV"),
         ("import time; time.sleep(60)", 0.5, "stopped at the limit of 0 s"),
     ],

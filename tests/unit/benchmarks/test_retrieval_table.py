@@ -33,5 +33,13 @@ def test_rows_ceilings_failures_and_means():
     assert "| sequential | 50.0 | 75.0 | 100.0 |" in text and "| netvlad | no weights |" in text
     assert "| possible | 75.0 | 100.0 | 100.0 |" in text and "| by chance | 66.7 | 100.0 | 100.0 |" in text
     # no set was finished by both
-    assert "## Mean" not in text
-    assert "## Mean of 2 sets" in render(values, ["a", "b"], ["sequential"])
+    assert text.count("## Mean") == 1 and "## Mean of 2 sets" in text
+    assert text.count("| sequential | 50.0 |") == 3 and text.count("| netvlad |") == 2
+    values["b|netvlad"] = {**one, "recalls": [10.0, 20.0, 30.0]}
+    text = render(values, ["a", "b"], ["sequential", "netvlad"])
+    assert (
+        "## Mean of 2 sets" in text and "## Mean of 1 sets" in text and text.count("| netvlad | 10.0") == 2
+    )
+    values["a|netvlad"] = one
+    text = render(values, ["a", "b"], ["sequential", "netvlad"])
+    assert text.count("## Mean") == 1 and "| netvlad | 30.0 | 47.5 | 65.0 |" in text

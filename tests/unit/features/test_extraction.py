@@ -49,7 +49,9 @@ def test_colors_are_of_the_pixel_that_holds_the_keypoint():
 def test_a_budget_counts_places_not_orientations(budget):
     rng = np.random.default_rng(1)
     gray = rng.integers(0, 255, (480, 640)).astype(np.uint8)
-    found = extract_keypoints(create_detector("sift"), gray, np.repeat(gray[..., None], 3, 2), budget, 760)
+    found = extract_keypoints(
+        create_detector("sift"), [(gray, np.repeat(gray[..., None], 3, 2))], budget, 760
+    )[0]
     assert len(found) == budget == len(np.unique(found.keypoints, axis=0))
 
 
@@ -65,7 +67,7 @@ def test_real_photographs_match_by_their_true_geometry(data):
     detector, points = create_detector("sift"), []
     for name in (first, second):
         pixels = read_image(folder / "images" / name)
-        points.append(extract_keypoints(detector, pixels.gray, pixels.rgb, 2000, 760))
+        points.append(*extract_keypoints(detector, [(pixels.gray, pixels.rgb)], 2000, 760))
     matcher = create_matcher("mutual_ratio")
     matches, _ = matcher.match(matcher.prepare(points[0]), matcher.prepare_second(points[1]))
     rays = []
