@@ -10,10 +10,9 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.compare.measure import ROOT
-from benchmarks.compare.sets import ImageSet, read_sets
+from benchmarks.compare.sets import DATA, ImageSet, read_sets
 from snakesfm.errors import SnakesfmError
 
-DATA = ROOT.parent / "shared" / "data"
 Value = Mapping[str, Any]
 
 

@@ -12,6 +12,7 @@ from snakesfm.artifacts import (
     TwoViewGeometries,
     ViewGraph,
 )
+from snakesfm.bundle.completion import correspondence_graph
 from snakesfm.bundle.model import BundleModel
 from snakesfm.geometry.camera import cameras_to_columns
 from snakesfm.view_graph.components import label_components
@@ -76,6 +77,13 @@ def true_model(made):
         made.track_image_ids,
         made.track_keypoint_ids,
     )
+
+
+def graph_of(made, matches=None):
+    """The matches, or others of the same pairs, for completion and registration."""
+    counts = [len(points) for points in made.keypoints]
+    matches = made.matches if matches is None else matches
+    return correspondence_graph(counts, made.pairs, made.match_offsets, matches)
 
 
 def side_by_side(first, second):

@@ -11,12 +11,11 @@ from benchmarks.compare.ablate import ablate
 from benchmarks.compare.measure import ROOT
 from benchmarks.compare.results import METHODS, read_results
 from benchmarks.compare.run import Campaign
-from benchmarks.compare.sets import read_sets
+from benchmarks.compare.sets import DATA, read_sets
 from benchmarks.compare.tables import describe_machine, render_csv, render_page
 from snakesfm.errors import SnakesfmError
 
 COMMANDS = ("run", "render", "ablate")
-DATA = ROOT.parent / "shared" / "data"
 
 
 def parse(arguments: list[str]) -> argparse.Namespace:

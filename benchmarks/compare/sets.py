@@ -7,9 +7,11 @@ from typing import Any
 
 import yaml
 
+from benchmarks.compare.measure import ROOT
 from snakesfm.errors import ConfigError
 from snakesfm.evaluation.colmap_model import read_model
 
+DATA = ROOT.parent / "shared" / "data"
 IMAGE_SUFFIXES = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp"}
 
 

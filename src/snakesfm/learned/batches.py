@@ -26,5 +26,9 @@ def equal_rows(keys: Sequence[Hashable]) -> list[list[int]]:
 
 def in_batches(keys: Sequence[Hashable], size: int) -> list[list[int]]:
     """The rows in batches of ``size`` or fewer, rows of equal keys one after the other."""
-    rows = [row for same in equal_rows(keys) for row in same]
+    return cut([row for same in equal_rows(keys) for row in same], size)
+
+
+def cut(rows: list[int], size: int) -> list[list[int]]:
+    """Rows in their order, ``size`` at a time; the last ones may be fewer."""
     return [rows[start : start + size] for start in range(0, len(rows), size)]

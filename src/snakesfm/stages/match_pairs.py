@@ -19,6 +19,7 @@ from snakesfm.artifacts.pairs import ImagePairs, PairCoordinates, PairMatches
 from snakesfm.errors import ImageError
 from snakesfm.features.keypoints import KeypointSet
 from snakesfm.front_ends import DETECTOR_FREE
+from snakesfm.learned.batches import cut
 from snakesfm.matching.detector_free import (
     DetectorFreeMatcher,
     Picture,
@@ -68,7 +69,7 @@ def run(job: StageJob) -> None:
         read_second = functools.lru_cache(HELD_IMAGES)(lambda j: matcher.prepare_second(source.read(j)))
         held, first = -1, None
         missing = np.array([row for row in range(len(pairs)) if row not in results], int)
-        for rows in _batches(_order(pairs, missing), job.network_batch()):
+        for rows in cut(_order(pairs, missing), job.network_batch()):
             prepared = []
             for i, j in pairs[rows].tolist():
                 if i != held:
@@ -90,10 +91,6 @@ def _match(matcher: Any, prepared: list[tuple[Any, Any]]) -> list[Matches]:
     if isinstance(matcher, BatchMatcher):
         return matcher.match_batch(prepared)
     return [matcher.match(first, second) for first, second in prepared]
-
-
-def _batches(rows: list[int], size: int) -> list[list[int]]:
-    return [rows[start : start + size] for start in range(0, len(rows), size)]
 
 
 def _create_matcher(job: StageJob, options: "MatchPairsOptions") -> Matcher:

@@ -5,10 +5,9 @@ from dataclasses import replace
 import cv2  # noqa: F401
 import numpy as np
 import pytest
-from synthetic_scene import true_model
+from synthetic_scene import graph_of, true_model
 
 from snakesfm.bundle import rounds
-from snakesfm.bundle.completion import correspondence_graph
 from snakesfm.bundle.interface import SolverSettings
 from snakesfm.bundle.model import from_reconstruction, to_reconstruction
 from snakesfm.geometry.camera import Camera
@@ -39,9 +38,7 @@ def adjusted(solving=None, **changes):
     reconstruction = to_reconstruction(model, made.keypoints, [f"{k}.jpg" for k in range(12)])
     rounds.adjust_rounds(
         reconstruction,
-        lambda: correspondence_graph(
-            [len(k) for k in made.keypoints], made.pairs, made.match_offsets, made.matches
-        ),
+        lambda: graph_of(made),
         model.cameras,
         solving or SolverSettings(),
         rounds.RoundSettings(thresholds_px=(20.0, 5.0, 3.0), **changes),

@@ -6,8 +6,9 @@ import cv2  # noqa: F401
 import numpy as np
 import pycolmap
 import pytest
+from synthetic_scene import graph_of
 
-from snakesfm.bundle.completion import TrackCompleter, correspondence_graph, drop_repeated_observations
+from snakesfm.bundle.completion import TrackCompleter, drop_repeated_observations
 from snakesfm.bundle.filtering import (
     deregister_weak_images,
     drop_short_tracks,
@@ -48,12 +49,6 @@ def model_of(made, left_out=(), keep=None):
         np.r_[0, np.cumsum(lengths)],
         made.track_image_ids[keep],
         made.track_keypoint_ids[keep],
-    )
-
-
-def graph_of(made):
-    return correspondence_graph(
-        [len(k) for k in made.keypoints], made.pairs, made.match_offsets, made.matches
     )
 
 
@@ -181,7 +176,7 @@ def test_left_out_image_is_registered_and_a_stranger_is_not():
     for side in (0, 1):
         rows = made.pairs[pair_of, side] == 7
         strange[rows, side] = rng.integers(0, len(made.keypoints[7]), rows.sum())
-    graph = correspondence_graph([len(k) for k in made.keypoints], made.pairs, made.match_offsets, strange)
+    graph = graph_of(made, strange)
     assert register_left_out(reconstruction, graph, 6.0, 15, 0.25, 0) == [4]
     pose = reconstruction.image(5).cam_from_world()
     assert np.degrees(angle_of(pose.rotation.matrix().T @ made.rotations[4])) < 0.3

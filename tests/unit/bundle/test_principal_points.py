@@ -5,10 +5,10 @@ from dataclasses import replace
 import cv2  # noqa: F401
 import numpy as np
 import pytest
+from synthetic_scene import graph_of, true_model
 
-from snakesfm.bundle.completion import correspondence_graph
 from snakesfm.bundle.interface import SolverSettings
-from snakesfm.bundle.model import BundleModel, from_reconstruction, to_reconstruction
+from snakesfm.bundle.model import from_reconstruction, to_reconstruction
 from snakesfm.bundle.rounds import RoundSettings, adjust_rounds
 from snakesfm.geometry.camera import Camera
 from snakesfm.synthetic.problems import make_problem
@@ -22,24 +22,17 @@ def refined(camera, noise_px=0.1, points=1000, per_image=False, held=frozenset()
     """The adjusted cameras of a scene seen by ``camera``, and the names of the rounds, from a centred start."""
     made = make_problem(12, points, noise_px=noise_px, camera=camera, seed=5)
     cameras = 12 if per_image else 1
-    model = BundleModel(
-        (CENTRED,) * cameras,
-        np.arange(12) % cameras,
-        made.rotations,
-        made.translations,
-        made.points,
-        made.track_offsets,
-        made.track_image_ids,
-        made.track_keypoint_ids,
-    )
+    model = replace(true_model(made), cameras=(CENTRED,) * cameras, camera_ids=np.arange(12) % cameras)
     reconstruction = to_reconstruction(model, made.keypoints, [f"{k}.jpg" for k in range(12)])
-    graph = correspondence_graph(
-        [len(k) for k in made.keypoints], made.pairs, made.match_offsets, made.matches
-    )
     records = []
     solving = SolverSettings(constant_cameras=held)
     adjust_rounds(
-        reconstruction, lambda: graph, model.cameras, solving, RoundSettings(**changes), records.append
+        reconstruction,
+        lambda: graph_of(made),
+        model.cameras,
+        solving,
+        RoundSettings(**changes),
+        records.append,
     )
     found = from_reconstruction(reconstruction, model).cameras
     return np.array([camera.params for camera in found]), [record.name for record in records]
