@@ -17,7 +17,7 @@ from snakesfm.bundle.filtering import (
     filter_observations,
     reset_wild_cameras,
 )
-from snakesfm.bundle.interface import BundleAdjuster, SolverSettings
+from snakesfm.bundle.interface import BundleAdjuster, Loss, SolverSettings
 from snakesfm.bundle.keypoint_refinement import refine_keypoints
 from snakesfm.bundle.principal_points import find_told_cameras
 from snakesfm.bundle.registration import left_out_images, register_left_out
@@ -27,6 +27,9 @@ from snakesfm.geometry.camera import Camera
 Array = NDArray[Any]
 
 EARLY_TOLERANCE = 300.0
+
+# of exact keypoints the model shows no noise but that of float32 and of the solver
+EXACT_PX = 0.05
 
 
 @dataclass(frozen=True)
@@ -39,6 +42,8 @@ class RoundSettings:
     loss_scale_px: float | Literal["auto"] = "auto"
     loss_scale_sigmas: float = 3.5
     early_loss_share: float = 0.4
+    last_loss: Loss = "huber"
+    outlier_sigmas: float = 12.0
     distortion_from_round: int = 2
     refine_principal_points: bool = True
     max_principal_point_gap: float = 0.003
@@ -139,6 +144,8 @@ def adjust_rounds(
         mapper.round("registration", settings.thresholds_px[-1], final=True)
     if settings.refine_principal_points and settings.solver == "ceres":
         mapper.refine_principal_points()
+    mapper.drop_outliers()
+    mapper.round("last pass", settings.thresholds_px[-1], final=True, last=True)
     return mapper.records
 
 
@@ -166,23 +173,33 @@ class _Mapper:
         self.held_graph: pycolmap.CorrespondenceGraph | None = None
 
     def round(
-        self, name: str, threshold_px: float, constant_rotations: bool = False, final: bool = False
+        self,
+        name: str,
+        threshold_px: float,
+        constant_rotations: bool = False,
+        final: bool = False,
+        last: bool = False,
     ) -> None:
-        """One pass of the solver and the filters after it; early passes are coarse and less robust.
+        """One pass of the solver and the filters after it; all but the last are coarse.
 
         The first of several holds the distortion, which would make up for a wrong focal length. A camera
         gone wild is held until the pass ends: the next one starts from better poses and points.
         """
         settings = self.settings
         solving = replace(self.solving, constant_rotations=constant_rotations)
+        if not last:
+            solving = replace(solving, function_tolerance=solving.function_tolerance * EARLY_TOLERANCE)
         if final:
             # the solver takes most memory here, and few models need their matches again
             self.held_graph = None
-            solving = replace(solving, loss_scale_px=self.loss_scale_px())
+            solving = replace(
+                solving,
+                loss=settings.last_loss if last else solving.loss,
+                loss_scale_px=self.loss_scale_px(),
+            )
         else:
             solving = replace(
                 solving,
-                function_tolerance=solving.function_tolerance * EARLY_TOLERANCE,
                 loss_scale_px=settings.early_loss_share * threshold_px,
                 # the few steps of a coarse pass cost less than these need to be prepared
                 inner_iterations=False,
@@ -241,6 +258,16 @@ class _Mapper:
         self.solving = replace(before, constant_cameras=held, refine_principal_points=True)
         self.round("principal points", self.settings.thresholds_px[-1], final=True)
         self.solving = before
+
+    def drop_outliers(self) -> None:
+        """Drop observations so far off that the keypoints' noise does not explain them."""
+        settings = self.settings
+        filter_observations(
+            self.reconstruction,
+            max(settings.outlier_sigmas * keypoint_noise_px(self.reconstruction), EXACT_PX),
+            settings.min_angle_deg,
+            settings.min_track_length,
+        )
 
     def loss_scale_px(self) -> float:
         """Where the loss of a final round sets in."""

@@ -10,7 +10,7 @@ from snakesfm.config.base import StageOptions
 class AdjustBundleOptions(StageOptions):
     """How cameras, poses and points are adjusted together."""
 
-    stage_version: ClassVar[int] = 8
+    stage_version: ClassVar[int] = 9
 
     solver: Literal["ceres", "gtsam"] = "ceres"
     """Least-squares solver: Ceres through pycolmap, or gtsam (slower, fewer camera models)."""
@@ -19,7 +19,7 @@ class AdjustBundleOptions(StageOptions):
     """Largest reprojection error of an observation after each of the chained rounds."""
 
     loss: Literal["huber", "cauchy", "squared"] = "cauchy"
-    """Robust loss of the reprojection errors."""
+    """Robust loss of the reprojection errors in all passes but the last."""
 
     loss_scale_px: Literal["auto"] | Annotated[float, Field(gt=0.0, le=100.0)] = "auto"
     """Reprojection error from which on the loss of the last round grows more slowly; 'auto' measures it."""
@@ -29,6 +29,12 @@ class AdjustBundleOptions(StageOptions):
 
     early_loss_share: float = Field(default=0.4, ge=0.0, le=10.0)
     """The same of earlier rounds, as a share of the round's threshold: a bad start needs a wide loss."""
+
+    outlier_sigmas: float = Field(default=12.0, ge=3.0, le=1000.0)
+    """Before the last pass, observations off by more standard deviations of the noise are dropped."""
+
+    last_loss: Literal["huber", "cauchy", "squared"] = "huber"
+    """Loss of the last pass, which has no far outliers, so that the tails may weigh more."""
 
     rotations_first: bool = False
     """Start with a pass that holds the averaged rotations fixed."""

@@ -79,7 +79,37 @@ def test_a_camera_that_is_always_wild_keeps_its_first_intrinsics():
     np.testing.assert_array_equal(adjusted(max_focal_change=1.001), START.params)
 
 
-def test_only_the_last_round_iterates_within_its_steps(passes):
+def test_final_passes_iterate_within_their_steps_and_only_the_last_is_solved_to_the_end(passes):
     found = adjusted(refine_principal_points=False)
-    assert [told.inner_iterations for told in passes] == [False, False, True]
+    assert [told.inner_iterations for told in passes] == [False, False, True, True]
+    assert [told.loss for told in passes] == ["cauchy", "cauchy", "cauchy", "huber"]
+    tolerances = [told.function_tolerance for told in passes]
+    assert tolerances == [300 * tolerances[-1]] * 3 + [SolverSettings().function_tolerance]
     assert abs(found[0] - TRUE.params[0]) < 5.0
+
+
+@pytest.mark.parametrize(("sigmas", "fewest", "most"), [(12.0, 0, 2), (1000.0, 25, 40)])
+def test_only_observations_within_the_noise_take_part_in_the_last_pass(monkeypatch, sigmas, fewest, most):
+    made = make_problem(12, 600, noise_px=0.05, camera=TRUE, seed=5)
+    wrong = np.random.default_rng(0).choice(len(made.keypoints[3]), 40, replace=False)
+    made.keypoints[3][wrong] += 2.0
+    model = true_model(made)
+    reconstruction = to_reconstruction(model, made.keypoints, [f"{k}.jpg" for k in range(12)])
+    seen = []
+    adjuster = rounds.bundle_adjuster("ceres")
+
+    def adjust(reconstruction, settings):
+        if settings.loss == "huber":
+            seen.append(sum(reconstruction.image(4).points2D[k].has_point3D() for k in wrong.tolist()))
+        return adjuster(reconstruction, settings)
+
+    monkeypatch.setattr(rounds, "bundle_adjuster", lambda solver: adjust)
+    rounds.adjust_rounds(
+        reconstruction,
+        lambda: graph_of(made),
+        model.cameras,
+        SolverSettings(),
+        rounds.RoundSettings(outlier_sigmas=sigmas, complete_tracks=False, refine_principal_points=False),
+        lambda record: None,
+    )
+    assert len(seen) == 1 and fewest <= seen[0] <= most

@@ -217,7 +217,7 @@ def test_rounds_are_chained_and_recover_the_truth():
     made = problem(outlier_ratio=0.05)
     result, records = run_rounds(made, perturbed(made), rotations_first=True)
     names = [record.name for record in records]
-    assert names == ["rotations fixed", "round 1", "round 2", "round 3"]
+    assert names == ["rotations fixed", "round 1", "round 2", "round 3", "last pass"]
     assert records[0].costs[0] > 5 * records[1].costs[1]
     for record in records:
         assert record.costs[1] <= record.costs[0]
@@ -238,7 +238,8 @@ def test_rounds_are_chained_and_recover_the_truth():
 def test_left_out_images_get_a_last_round():
     made = problem()
     result, records = run_rounds(made, perturbed(made, left_out=[6]))
-    assert records[-1].name == "registration" and records[-1].counts[0] == 12
+    assert [record.name for record in records[-2:]] == ["registration", "last pass"]
+    assert records[-1].counts[0] == 12
     assert np.isfinite(result.rotations).all()
     stays, _ = run_rounds(made, perturbed(made, left_out=[6]), register_images=False)
     assert np.isnan(stays.rotations[6]).all()
@@ -254,7 +255,7 @@ def test_an_image_that_is_thrown_out_again_is_registered_once():
     limits = {"register_min_inliers": 6, "min_observations": SEEN}
     result, records = run_rounds(made, perturbed(made, left_out=[6]), **limits)
     assert [record.name for record in records].count("registration") == 1
-    assert np.isnan(result.rotations[6]).all() and records[-1].counts[0] == 11
+    assert np.isnan(result.rotations[6]).all() and 10 <= records[-1].counts[0] <= 11
 
 
 def test_rounds_are_deterministic():

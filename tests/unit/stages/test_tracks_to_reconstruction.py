@@ -78,7 +78,7 @@ def test_stages_in_a_row(made, inputs, tmp_path, capsys):
     assert 1e-3 < errors.mean() < 0.3
     assert 0.15 < np.average(model.errors_px, weights=np.diff(model.offsets)) < 0.6
     np.testing.assert_array_equal(model.camera_params[0, :4], made.cameras[0].params)
-    assert model.round_names.tolist() == ["round 1", "round 2", "round 3", "registration"]
+    assert model.round_names.tolist() == ["round 1", "round 2", "round 3", "registration", "last pass"]
     assert model.round_counts[-1].tolist() == [COUNT, len(model.points), len(model.image_ids)]
     assert model.round_errors_px[-1] == pytest.approx(model.errors_px.mean(), abs=0.02)
     printed = capsys.readouterr().out
