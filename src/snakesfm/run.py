@@ -13,7 +13,8 @@ from typing import Any
 
 from snakesfm import slurm
 from snakesfm.errors import ConfigError
-from snakesfm.plan import Plan, ScenePlan
+from snakesfm.plan import Plan
+from snakesfm.scene_plan import ScenePlan
 
 LOCK_NAME = ".snakesfm.lock"
 MOST_SENTENCES = 10

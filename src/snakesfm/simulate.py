@@ -22,7 +22,6 @@ from snakesfm.artifacts.images import CalibratedCameras, ImageIndex
 from snakesfm.artifacts.pairs import REJECTIONS, ImagePairs, PairMatches, TwoViewGeometries
 from snakesfm.blocks import choose_blocks, tile_names
 from snakesfm.config.configuration import options_class
-from snakesfm.config.match_pairs import MatchPairsOptions
 from snakesfm.errors import ConfigError, SnakesfmError
 from snakesfm.geometry.camera import Camera, cameras_to_columns
 from snakesfm.geometry.poses import translation_of
@@ -315,9 +314,7 @@ class Simulation:
         return self.folder / "results" / self.scene / stage / f"{file}.h5"
 
     def _header(self, stage: str) -> Header:
-        options = options_class(stage)()
-        if isinstance(options, MatchPairsOptions):
-            options = options.resolve()
+        options = options_class(stage)().resolved()
         return Header(stage, options.stage_version, self.scene, options.canonical_json())
 
     def _digest(self, *what: str) -> str:

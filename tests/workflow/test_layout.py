@@ -12,6 +12,7 @@ DOMAIN_MAY_IMPORT_NOT = (
     "snakesfm.stages",
     "snakesfm.artifacts",
     "snakesfm.plan",
+    "snakesfm.scene_plan",
     "snakesfm.job",
     "h5py",
     "snakemake",

@@ -1,7 +1,7 @@
 """What all options models share."""
 
 import json
-from typing import ClassVar
+from typing import ClassVar, Self
 
 from pydantic import BaseModel, ConfigDict
 
@@ -20,3 +20,7 @@ class StageOptions(BaseModel):
     def canonical_json(self) -> str:
         """The options as JSON with sorted keys: equal options give equal text."""
         return json.dumps(self.model_dump(mode="json"), sort_keys=True)
+
+    def resolved(self) -> Self:
+        """The options with 'auto' replaced where these options alone tell what it means."""
+        return self

@@ -54,7 +54,7 @@ class MatchPairsOptions(StageOptions):
     noise_px: float = Field(0.3, ge=0.0, le=100.0)
     """Standard deviation of the second place of each match of the oracle 'virtual_places'."""
 
-    def resolve(self) -> Self:
+    def resolved(self) -> Self:
         """The options with 'auto' replaced by what it means for the method."""
         if self.min_score != "auto":
             return self

@@ -1,0 +1,377 @@
+"""What the Snakefile asks of one scene: its blocks, tiles, files, and what each job is told.
+
+Everything here is computed from the configuration and the listing of the image folder, so the graph of
+jobs is known before anything runs.
+"""
+
+import functools
+import json
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+from snakesfm.blocks import choose_blocks, tile_names
+from snakesfm.config.base import StageOptions
+from snakesfm.config.configuration import STAGES, SceneInputs
+from snakesfm.config.select_pairs import SelectPairsOptions
+from snakesfm.digests import file_digest, file_state, options_digest
+from snakesfm.errors import ConfigError
+from snakesfm.front_ends import (
+    DETECTOR_FREE,
+    FRONT_ENDS,
+    LEARNED_DESCRIPTORS,
+    check_methods,
+    fetch_command,
+    needed_weights,
+)
+from snakesfm.ingest.discover import count_images, fingerprint_images
+from snakesfm.resources import Load, job_load
+
+SCENE_ARTIFACTS = (
+    "index_images/index.h5",
+    "calibrate_cameras/cameras.h5",
+    "build_view_graph/graph.h5",
+    "filter_view_graph/graph.h5",
+    "average_rotations/rotations.h5",
+    "build_tracks/tracks.h5",
+    "average_translations/centers.h5",
+    "triangulate_tracks/points.h5",
+    "adjust_bundle/reconstruction.h5",
+)
+
+
+class ScenePlan:
+    """One scene's blocks, tiles and what its stages are told."""
+
+    def __init__(self, name: str, inputs: SceneInputs, configuration: Any, output: Path) -> None:
+        self.name = name
+        self.inputs = inputs
+        self.configuration = configuration
+        self.folder = output / name
+        check_methods(self.method("extract_features"), self.method("match_pairs"))
+
+    def check(self) -> None:
+        """Refuse paths that are not there, or whose files do not serve.
+
+        Raises
+        ------
+        ConfigError : says which and what to do.
+        """
+        self._check_paths()
+        models = [model for stage in STAGES for model in self.models(stage)]
+        if len(models) > 1 and self.weights.is_file():
+            raise ConfigError(
+                f"weights={self.weights} is one file, but scene '{self.name}' needs those of "
+                f"{len(models)} networks ({', '.join(models)}): give a folder that holds them all."
+            )
+
+    def _check_paths(self) -> None:
+        images = Path(self.inputs.images).expanduser()
+        if not images.is_dir():
+            hint = "make it with 'make demo', or " if self.inputs.images == "demo/images" else ""
+            raise ConfigError(
+                f"The image folder '{images}' does not exist: {hint}say which folder with "
+                "--config images=PATH (name a path with ' #' in it in a file for --configfile: "
+                "Snakemake cuts it there)."
+            )
+        if self.folder.resolve().is_relative_to(images.resolve()):
+            raise ConfigError(
+                f"The output folder '{self.folder.parent}' lies inside the image folder '{images}', so its "
+                "pictures would be taken for photographs: give another output=DIR."
+            )
+        if count_images(images, 1) == 0:
+            raise ConfigError(
+                f"The folder '{images}' holds no JPEG, PNG, TIFF, WebP or BMP image: "
+                "say with --config images=PATH which folder does."
+            )
+        if self.configuration.select_pairs.method == "listed" and not self.pairs_file:
+            raise ConfigError(
+                f"select_pairs.method is 'listed', but scene '{self.name}' has no list: "
+                "give it with pairs=FILE."
+            )
+        methods = (self.method("extract_features"), self.method("match_pairs"))
+        oracle = next((name for name in methods if name in ("virtual", "virtual_places")), "")
+        if oracle and not self.inputs.reference:
+            raise ConfigError(
+                f"The front-end '{oracle}' takes the points of a reference model, but scene '{self.name}' "
+                "has none: give reference=PATH."
+            )
+        if self.method("extract_features") == "imported" and not self.inputs.imported:
+            raise ConfigError(
+                f"The front-end 'imported' reads hloc's files, but scene '{self.name}' names none: "
+                "give imported=DIR."
+            )
+        for key in ("reference", "cameras", "pairs", "imported"):
+            path = getattr(self.inputs, key)
+            if path and not Path(path).expanduser().exists():
+                raise ConfigError(
+                    f"'{path}', given as {key}= for scene '{self.name}', does not exist: "
+                    "correct the path or remove the key."
+                )
+
+    def method(self, stage: str) -> str:
+        """The method of a stage, by the front-end's name where one is given."""
+        front_end = FRONT_ENDS.get(self.configuration.front_end)
+        if front_end is None or stage not in ("extract_features", "match_pairs"):
+            return str(getattr(getattr(self.configuration, stage), "method", ""))
+        return front_end.detector if stage == "extract_features" else front_end.matcher
+
+    @property
+    def images(self) -> Path:
+        """The image folder."""
+        return Path(self.inputs.images).expanduser()
+
+    @functools.cached_property
+    def image_count(self) -> int:
+        """Number of files that look like images."""
+        return count_images(self.images, None)
+
+    @functools.cached_property
+    def blocks(self) -> int:
+        """Number of blocks."""
+        blocks = self.configuration.blocks
+        return choose_blocks(self.image_count) if blocks == "auto" else int(blocks)
+
+    @functools.cached_property
+    def select_pairs(self) -> SelectPairsOptions:
+        """How pairs are chosen, with 'auto' resolved."""
+        options: SelectPairsOptions = self.configuration.select_pairs
+        return options.resolve(self.image_count, self.pairs_file)
+
+    @property
+    def pairs_file(self) -> str:
+        """The list of pairs that is given, or that comes with imported matches; "" for none."""
+        beside = Path(self.inputs.imported).expanduser() / "pairs.txt"
+        if not self.inputs.pairs and self.method("match_pairs") == "imported" and beside.is_file():
+            return str(beside)
+        return self.inputs.pairs
+
+    def options(self, stage: str) -> StageOptions:
+        """The options of a stage in this scene."""
+        if stage == "select_pairs":
+            return self.select_pairs
+        options: StageOptions = getattr(self.configuration, stage)
+        if stage in ("extract_features", "match_pairs"):
+            options = options.model_copy(update={"method": self.method(stage)})
+        if stage == "adjust_bundle" and self.method("extract_features") == "virtual":
+            # what the images show is less exact than the projections of the model's points
+            return options.model_copy(update={"refine_keypoints": False})
+        return options.resolved()
+
+    def models(self, stage: str) -> list[str]:
+        """The networks whose weights a stage reads."""
+        if stage == "describe_images" and not self.select_pairs.needs_descriptors:
+            return []
+        if stage == "extract_features" and not self.detects_keypoints:
+            return []
+        return self.possible_models(stage)
+
+    def possible_models(self, stage: str) -> list[str]:
+        """The networks whose weights a stage reads if it runs at all."""
+        return needed_weights(stage, self.method(stage), self.method("extract_features"))
+
+    @property
+    def detects_keypoints(self) -> bool:
+        """Whether extract_features runs: for the matching, or for the choice of pairs."""
+        by_keypoints = self.select_pairs.needs_descriptors and not self.describes_pictures
+        return not self.detector_free or by_keypoints
+
+    @property
+    def weights(self) -> Path:
+        """The weights folder."""
+        return Path(self.configuration.weights).expanduser()
+
+    def gpus(self, stage: str) -> int:
+        """How many GPUs a job of a stage makes use of."""
+        return 1 if self.models(stage) else 0
+
+    def source_settings(self, stage: str) -> dict[str, Any]:
+        """What a stage is told of where known keypoints or matches are; nothing where it finds them."""
+        method = self.method(stage)
+        if method == "virtual_places" or (method == "virtual" and stage == "extract_features"):
+            reference = str(Path(self.inputs.reference).expanduser())
+            return {"reference": reference, "source_content": file_digest(reference)}
+        if method == "imported":
+            folder = Path(self.inputs.imported).expanduser()
+            name = "features.h5" if stage == "extract_features" else "matches.h5"
+            return {"imported": str(folder), "source_content": file_state(folder / name)}
+        return {}
+
+    def weight_settings(self, stage: str, main_process: bool) -> dict[str, Any]:
+        """What a stage is told of its networks' weights; nothing where it has none."""
+        models = self.models(stage)
+        if not models:
+            return {}
+        # imported here, as most runs have no networks and every job parses the Snakefile
+        from snakesfm.learned.weights import weights_digest
+
+        names = ("extract_features", "describe_images", "match_pairs")
+        methods = {name: self.method(name) for name in names}
+        return {
+            "weights": str(self.weights),
+            "models": models,
+            "weights_content": weights_digest(models, self.weights) if main_process else "",
+            "fetch": fetch_command(self.configuration.front_end, methods, str(self.weights)),
+            "device": self.configuration.device,
+        }
+
+    def files(self, stage: str, parts: str) -> list[str]:
+        """All files of a stage that works on 'blocks' or on 'tiles'."""
+        names = tile_names(self.blocks) if parts == "tiles" else map(str, range(self.blocks))
+        return [str(self.folder / stage / f"{name}.h5") for name in names]
+
+    @property
+    def detector_free(self) -> bool:
+        """Whether pairs are matched without keypoints, which are then merged from the matches."""
+        return self.method("match_pairs") in DETECTOR_FREE
+
+    @property
+    def features_stage(self) -> str:
+        """The stage whose keypoints the stages after matching read."""
+        return "merge_keypoints" if self.detector_free else "extract_features"
+
+    @property
+    def matches_stage(self) -> str:
+        """The stage whose matches the stages after matching read."""
+        return "index_matches" if self.detector_free else "match_pairs"
+
+    def tile_features(self, tile: str) -> list[str]:
+        """The one or two blocks of keypoints that belong to a tile's matches."""
+        blocks = sorted({int(block) for block in tile.split("-")})
+        return [str(self.folder / self.features_stage / f"{block}.h5") for block in blocks]
+
+    def block_tiles(self, block: str) -> list[str]:
+        """The tiles of coordinates with a block's images."""
+        tiles = [name for name in tile_names(self.blocks) if block in name.split("-")]
+        return [str(self.folder / "match_pairs" / f"{name}.h5") for name in tiles]
+
+    def global_descriptors(self) -> list[str]:
+        """The global descriptors of all blocks where pairs are retrieved, else nothing."""
+        return self.files("describe_images", "blocks") if self.select_pairs.needs_descriptors else []
+
+    @property
+    def describes_pictures(self) -> bool:
+        """Whether a network describes the images themselves, instead of their local descriptors."""
+        return self.method("describe_images") in LEARNED_DESCRIPTORS
+
+    def vocabulary(self) -> list[str]:
+        """The codebook of local descriptors where they describe the images, else nothing."""
+        return [] if self.describes_pictures else [str(self.folder / "learn_vocabulary" / "vocabulary.h5")]
+
+    @functools.cached_property
+    def pair_count(self) -> int:
+        """Most pairs that will be chosen, as far as is known before anything runs."""
+        options, images = self.select_pairs, self.image_count
+        everything = images * (images - 1) // 2
+        if options.method == "exhaustive":
+            return everything
+        if options.method == "listed":
+            lines = Path(self.pairs_file).expanduser().read_text("utf-8", errors="replace").splitlines()
+            return min(len(lines), everything)
+        # a similar image is mostly found from one side alone
+        per_image = options.look_ahead * ("sequential" in options.method)
+        per_image += int(options.top_k) * options.needs_descriptors
+        return min(images * per_image, everything)
+
+    def load(self, stage: str) -> Load:
+        """What one job of a stage works on, on average over the blocks or tiles."""
+        networks = len(self.models(stage))
+        # a CUDA device holds its batches in memory of its own
+        wanted = 1 if self.configuration.device == "cuda" else self.configuration.batch_size
+        batch = 1 if wanted == "auto" else wanted
+        return job_load(stage, self.image_count, self.blocks, self.pair_count, networks, batch)
+
+    def final_files(self) -> list[str]:
+        """What a person looks at: the scene's model, its metrics and its report."""
+        names = ("export_model/summary.json", "evaluate_model/metrics.json", "render_report/index.html")
+        return [str(self.folder / name) for name in names]
+
+    def database_file(self) -> str:
+        """The COLMAP database of features and two-view geometries, which only its own target makes."""
+        return str(self.folder / "export_database" / "database.db")
+
+    def hloc_files(self) -> list[str]:
+        """Features and matches in hloc's files, which only their own target makes."""
+        names = ("features.h5", "matches.h5", "pairs.txt")
+        return [str(self.folder / "export_hloc" / name) for name in names]
+
+    def all_files(self) -> list[str]:
+        """What a run makes of the scene; Snakemake re-makes a lost file only if it is asked for by name."""
+        files = [str(self.folder / name) for name in SCENE_ARTIFACTS]
+        files += self.files(self.features_stage, "blocks")
+        for stage in dict.fromkeys(
+            ("select_pairs", "match_pairs", self.matches_stage, "estimate_two_view")
+        ):
+            files += self.files(stage, "tiles")
+        if self.select_pairs.needs_descriptors:
+            files += [*self.vocabulary(), *self.files("describe_images", "blocks")]
+        return files + self.final_files()
+
+    @functools.cached_property
+    def _fingerprint(self) -> str:
+        return fingerprint_images(self.images, self.folder / "index_images" / "digests.json")
+
+    def settings(self, stage: str, wildcards: Mapping[str, str], main_process: bool) -> dict[str, Any]:
+        """What a stage is told beside its options."""
+        inputs = self.inputs
+        if stage == "index_images":
+            # only the controller compares params, so only it reads the images to see whether they changed
+            content = self._fingerprint if main_process else ""
+            return {
+                "images": str(self.images),
+                "cameras": inputs.cameras,
+                "cameras_content": file_digest(inputs.cameras),
+                "blocks": self.blocks,
+                "content": content,
+            }
+        if stage == "extract_features":
+            settings = {"images": str(self.images), "block": int(wildcards["block"])}
+            return settings | self.weight_settings(stage, main_process) | self.source_settings(stage)
+        if stage == "match_pairs":
+            learned = self.weight_settings(stage, main_process)
+            known = learned | self.source_settings(stage)
+            if self.detector_free:
+                return {"images": str(self.images)} | known
+            return {"detector": self.method("extract_features")} | known
+        if stage == "describe_images" and self.describes_pictures:
+            settings = {"images": str(self.images), "block": int(wildcards["block"])}
+            return settings | self.weight_settings(stage, main_process)
+        if stage == "merge_keypoints":
+            return {"images": str(self.images), "block": int(wildcards["block"])}
+        if stage == "select_pairs":
+            return {
+                "blocks": self.blocks,
+                "pairs_file": self.pairs_file,
+                "pairs_content": file_digest(self.pairs_file),
+            }
+        if stage == "adjust_bundle":
+            return {"images": str(self.images), "intrinsics": inputs.intrinsics}
+        if stage == "export_model":
+            return {"images": str(self.images)}
+        if stage == "evaluate_model":
+            return {"reference": inputs.reference, "reference_content": file_digest(inputs.reference)}
+        return {}
+
+    def params(self, stage: str, wildcards: Mapping[str, str], main_process: bool) -> str:
+        """All that determines a job's result beside its input files, as one canonical JSON string."""
+        options = self.options(stage)
+        content = {
+            "options": json.loads(options.canonical_json()),
+            "stage_version": options.stage_version,
+            "settings": self.settings(stage, wildcards, main_process),
+            "seed": self.configuration.seed,
+        }
+        return json.dumps(content, sort_keys=True)
+
+    def upstream(self, inputs: Iterable[str]) -> dict[str, str]:
+        """The options digest of every stage that made one of these files; a job checks them against it."""
+        stages = {part for path in inputs for part in Path(path).parent.parts[-3:] if part in STAGES}
+        return {stage: self._options_digests[stage] for stage in sorted(stages)}
+
+    @functools.cached_property
+    def _options_digests(self) -> dict[str, str]:
+        options = {stage: self.options(stage) for stage in STAGES}
+        return {
+            stage: options_digest(value.stage_version, value.canonical_json())
+            for stage, value in options.items()
+        }
