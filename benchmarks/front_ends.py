@@ -12,7 +12,8 @@ import sys
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from benchmarks.compare.measure import ROOT, CommandError
+from benchmarks import ROOT
+from benchmarks.compare.measure import CommandError
 from benchmarks.compare.methods import snakesfm
 from benchmarks.compare.sets import ImageSet
 from benchmarks.on_sets import Run, SetTable, Value, finished, markdown_head, markdown_row

@@ -18,13 +18,13 @@ import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+from benchmarks import ROOT
 from benchmarks.job_logs import DONE
 from benchmarks.marked_tables import replace_table
 from snakesfm.synthetic.render_demo import make_demo
 from snakesfm.synthetic.scene import DemoOptions
 from tests.slurm_cluster import Cluster, missing_programs
 
-ROOT = Path(__file__).resolve().parents[1]
 RECORDS = Path(__file__).with_suffix(".json")
 PAGE = ROOT / "docs" / "cluster.md"
 SCENE = DemoOptions(image_count=16, width=400, height=300)

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from benchmarks.compare.measure import ROOT
+from benchmarks import ROOT
 from benchmarks.compare.sets import DATA, ImageSet, read_sets
 from snakesfm.errors import SnakesfmError
 

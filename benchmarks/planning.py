@@ -19,12 +19,12 @@ import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+from benchmarks import ROOT
 from benchmarks.marked_tables import replace_table
 from snakesfm.blocks import tile_names
 from snakesfm.synthetic.render_demo import make_demo
 from snakesfm.synthetic.scene import DemoOptions
 
-ROOT = Path(__file__).resolve().parents[1]
 RECORDS = Path(__file__).with_suffix(".json")
 PAGE = ROOT / "docs" / "cluster.md"
 SCENE = DemoOptions(image_count=16, width=400, height=300)

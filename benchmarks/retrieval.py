@@ -15,7 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.compare.measure import ROOT, CommandError, run_measured
+from benchmarks import ROOT
+from benchmarks.compare.measure import CommandError, run_measured
 from benchmarks.compare.sets import ImageSet
 from benchmarks.on_sets import Run, SetTable, Value, finished, markdown_head, markdown_row
 from snakesfm.artifacts import GlobalDescriptors, ImageIndex

@@ -7,8 +7,8 @@ import signal
 import sys
 from pathlib import Path
 
+from benchmarks import ROOT
 from benchmarks.compare.ablate import ablate
-from benchmarks.compare.measure import ROOT
 from benchmarks.compare.results import METHODS, read_results
 from benchmarks.compare.run import Campaign
 from benchmarks.compare.sets import DATA, read_sets

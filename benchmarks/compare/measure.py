@@ -15,7 +15,8 @@ from typing import Any
 
 import psutil
 
-ROOT = Path(__file__).resolve().parents[2]
+from benchmarks import ROOT
+
 SAMPLE_S = 0.2
 FOLDERS = re.compile(r"(?:/[^\s/]+)+/")
 UNDISTURBED = 0.05

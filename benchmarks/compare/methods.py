@@ -9,7 +9,8 @@ from dataclasses import asdict
 from datetime import datetime
 from pathlib import Path
 
-from benchmarks.compare.measure import ROOT, Cost, run_measured, run_operation
+from benchmarks import ROOT
+from benchmarks.compare.measure import Cost, run_measured, run_operation
 from benchmarks.compare.sets import ImageSet
 from benchmarks.job_logs import DONE
 from snakesfm.artifacts import ImageIndex, TwoViewGeometries

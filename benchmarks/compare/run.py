@@ -10,8 +10,9 @@ from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
 
+from benchmarks import ROOT
 from benchmarks.compare import methods
-from benchmarks.compare.measure import ROOT, CommandError, Cost
+from benchmarks.compare.measure import CommandError, Cost
 from benchmarks.compare.results import GLOBAL, INCREMENTAL, OPENMVG, OURS, OWN, SAME, Result, evaluate
 from benchmarks.compare.sets import ImageSet
 from snakesfm.errors import SnakesfmError

@@ -7,7 +7,7 @@ from typing import Any
 
 import yaml
 
-from benchmarks.compare.measure import ROOT
+from benchmarks import ROOT
 from snakesfm.errors import ConfigError
 from snakesfm.evaluation.colmap_model import read_model
 

@@ -14,7 +14,8 @@ import os
 import tempfile
 from pathlib import Path
 
-from benchmarks.growth.measure import ROOT, load, measure, save
+from benchmarks import ROOT
+from benchmarks.growth.measure import load, measure, save
 from benchmarks.growth.report import write_report
 from snakesfm.config.configuration import STAGES
 from snakesfm.simulate import UNTIL, SimulationOptions

@@ -12,11 +12,11 @@ from pathlib import Path
 import h5py
 import yaml
 
+from benchmarks import ROOT
 from benchmarks.job_logs import DONE
 from snakesfm.blocks import choose_blocks
 from snakesfm.simulate import Simulation, SimulationOptions
 
-ROOT = Path(__file__).resolve().parents[2]
 PAIRS = re.compile(r"^(\d+) pairs", re.MULTILINE)
 TILED = ("match_pairs", "estimate_two_view")
 ACCURACY = ("relative_pose_auc_1deg", "relative_pose_auc_5deg", "position_error_percent_median")
