@@ -1,10 +1,17 @@
 """Options of export_model."""
 
+from typing import ClassVar, Literal
+
 from snakesfm.config.base import StageOptions
 
 
 class ExportModelOptions(StageOptions):
     """How the model is written for other tools."""
+
+    stage_version: ClassVar[int] = 2
+
+    georeference: Literal["auto"] | bool = "auto"
+    """Move models to metres east, north and up by the GPS in EXIF; 'auto': where the two agree."""
 
     link_images: bool = True
     """Link the images beside the model, so that 3DGS and nerfstudio tools read the folder as it is."""

@@ -4,6 +4,7 @@ import json
 import shutil
 import sys
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,10 +15,12 @@ from snakesfm.export.colmap import (
     registered_images,
     summarize,
 )
+from snakesfm.export.georeference import Georeference, georeference, local_origin
 from snakesfm.export.image_folder import place_images
 from snakesfm.export.nerfstudio import camera_warnings, transforms
 from snakesfm.export.undistorted import write_undistorted
 from snakesfm.geometry.camera import Camera, cameras_from_columns
+from snakesfm.geometry.poses import center_of, translation_of
 from snakesfm.stages.job import StageJob
 
 if TYPE_CHECKING:
@@ -37,12 +40,14 @@ OTHER_MODELS = (
     "own, in a folder beside sparse/0 ({count} in number)."
 )
 
+NO_PLACE = "georeference is true, but fewer than four registered images tell their position in EXIF."
+
 
 def run(job: StageJob) -> None:
     """Write the files that ``job.outputs`` names, complete or not at all, summary.json last."""
     index = ImageIndex.read(job.path("index"))
     adjusted = Reconstruction.read(job.path("reconstruction"))
-    model = adjusted.select_model(0)
+    model, place = _placed(job, index, adjusted.select_model(0))
     cameras = cameras_from_columns(model.camera_models, model.camera_sizes, model.camera_params)
     names = [str(name) for name in index.names]
     registered = registered_images(model.rotations, model.translations)
@@ -53,6 +58,8 @@ def run(job: StageJob) -> None:
     others = other_model_sizes(adjusted.models)
     if others:
         warnings.append(OTHER_MODELS.format(images=sum(others), count=len(others)))
+    if job.options.georeference is True and place is None:
+        warnings.append(NO_PLACE)
     for line in warnings:
         sys.stderr.write(f"warning: {line}\n")
     folder = _export_folder(job)
@@ -65,7 +72,7 @@ def run(job: StageJob) -> None:
         for number in range(max(1, adjusted.model_count)):
             folder_of = sparse / str(number)
             folder_of.mkdir(parents=True)
-            selected = adjusted.select_model(number) if number else model
+            selected = _placed(job, index, adjusted.select_model(number))[0] if number else model
             colmap = _build(names, index, cameras, selected)
             colmap.write_binary(str(folder_of))
             colmap.write_text(str(folder_of))
@@ -76,7 +83,7 @@ def run(job: StageJob) -> None:
         )
         _write_json(temporary / "transforms.json", content)
         summary = summarize(job.scene, names, adjusted.models, model.offsets, model.errors_px, warnings)
-        _write_json(temporary / SUMMARY, summary)
+        _write_json(temporary / SUMMARY, {**summary, "georeference": place and place.summary()})
         options: ExportModelOptions = job.options
         if options.link_images or options.undistort:
             place_images(folder / "images", Path(job.settings["images"]), names, index.orientations)
@@ -86,6 +93,25 @@ def run(job: StageJob) -> None:
         for former in (folder / "sparse").glob("[1-9]*"):
             shutil.rmtree(former)
         _publish(temporary, folder)
+
+
+def _placed(
+    job: StageJob, index: ImageIndex, model: Reconstruction
+) -> tuple[Reconstruction, Georeference | None]:
+    """The model in metres east, north and up where EXIF tells where that is, and how well it does."""
+    wanted = job.options.georeference
+    origin = local_origin(index.gps) if wanted else None
+    if origin is None:
+        return model, None
+    centers = center_of(model.rotations, model.translations)
+    place = georeference(centers, index.gps, origin, job.seed_for("georeference"))
+    if place is None or not (place.trusted or wanted is True):
+        return model, None
+    move = place.local_from_model
+    rotations = move.transform_rotations(model.rotations)
+    translations = translation_of(rotations, move.transform_points(centers))
+    points = move.transform_points(model.points)
+    return replace(model, rotations=rotations, translations=translations, points=points), place
 
 
 def _build(

@@ -56,8 +56,10 @@ def problem() -> SyntheticProblem:
 CAMERA = Camera("SIMPLE_RADIAL", 640, 480, (500.0, 320.0, 240.0, 0.02))
 
 
-def write_index(folder: Path, orientations: np.ndarray | None = None) -> Path:
-    folder.mkdir(exist_ok=True)
+def write_index(
+    folder: Path, orientations: np.ndarray | None = None, gps: np.ndarray | None = None
+) -> Path:
+    folder.mkdir(parents=True, exist_ok=True)
     models, sizes, params, sources = cameras_to_columns([CAMERA, CAMERA])
     ImageIndex(
         names=NAMES,
@@ -67,7 +69,7 @@ def write_index(folder: Path, orientations: np.ndarray | None = None) -> Path:
         camera_ids=np.arange(COUNT) % 2,
         orientations=np.ones(COUNT, np.int32) if orientations is None else orientations,
         focal_exif_px=np.full(COUNT, np.nan),
-        gps=np.full((COUNT, 3), np.nan),
+        gps=np.full((COUNT, 3), np.nan) if gps is None else gps,
         duplicate_of=np.full(COUNT, -1),
         camera_models=models,
         camera_sizes=sizes,
@@ -122,10 +124,11 @@ def export(
     problem: SyntheticProblem,
     orientations: np.ndarray | None = None,
     lost: Iterable[int] = (LOST,),
+    gps: np.ndarray | None = None,
     **options: bool,
 ) -> Path:
     inputs = {
-        "index": str(write_index(tmp_path, orientations)),
+        "index": str(write_index(tmp_path, orientations, gps)),
         "reconstruction": str(write_reconstruction(tmp_path, problem, lost)),
     }
     folder = tmp_path / "out" / "scene" / "export_model"
@@ -217,6 +220,53 @@ def test_summary_says_what_is_there_and_what_is_missing(tmp_path, problem) -> No
     assert summary["mean_track_length"] == pytest.approx(summary["observations"] / summary["points"])
     assert len(summary["warnings"]) == 1
     assert "spaces" in summary["warnings"][0]
+
+
+def gps_of(problem: SyntheticProblem, noise_m: float) -> np.ndarray:
+    """Positions of a flight: the model turned about its x axis and a hundred times as large."""
+    centers = -np.einsum("nji,nj->ni", problem.rotations, problem.translations) * 100.0
+    places = centers @ np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+    places += np.random.default_rng(1).normal(size=places.shape) * noise_m
+    return pycolmap.GPSTransform().enu_to_ellipsoid(places, 47.0, 8.0, 500.0)
+
+
+def test_a_model_with_positions_in_exif_is_in_metres_and_the_same_in_all_files(tmp_path, problem) -> None:
+    gps = gps_of(problem, 0.5)
+    folder = export(tmp_path, problem, gps=gps)
+    summary = json.loads((folder / "summary.json").read_text())["georeference"]
+    assert summary["images_with_position"] == 8 and 4 <= summary["inliers"] <= 8
+    assert 0.05 < summary["median_residual_m"] < 2.0
+    model = read_model(folder / "sparse" / "0")
+    origin = summary["origin_latitude_longitude_altitude"]
+    local = pycolmap.GPSTransform().ellipsoid_to_enu(gps, *origin)
+    frames = json.loads((folder / "transforms.json").read_text())["frames"]
+    for frame in frames:
+        image = model.images[frame["colmap_im_id"]]
+        center = image.projection_center()
+        np.testing.assert_allclose(np.array(frame["transform_matrix"])[:3, 3], center, atol=1e-9)
+        assert np.linalg.norm(center - local[image.image_id - 1]) < 3.0
+    assert 0.2 < model.compute_mean_reprojection_error() < 0.6
+    points = {tuple(np.round(point.xyz, 3)) for point in model.points3D.values()}
+    cloud = pycolmap.Reconstruction()
+    cloud.import_PLY(str(folder / "points.ply"))
+    np.testing.assert_allclose(
+        sorted(np.round(point.xyz, 3).tolist() for point in cloud.points3D.values()),
+        sorted(map(list, points)),
+        atol=0.01,
+    )
+
+
+def test_the_world_stays_where_positions_contradict_it_or_are_not_wanted(tmp_path, problem) -> None:
+    plain = export(tmp_path / "plain", problem)
+    without = (plain / "sparse/0/images.bin").read_bytes()
+    for name, noise, options in (("bad", 300.0, {}), ("off", 0.5, {"georeference": False})):
+        folder = export(tmp_path / name, problem, gps=gps_of(problem, noise), **options)
+        assert (folder / "sparse/0/images.bin").read_bytes() == without
+        assert json.loads((folder / "summary.json").read_text())["georeference"] is None
+    asked = export(tmp_path / "asked", problem, georeference=True)
+    summary = json.loads((asked / "summary.json").read_text())
+    assert summary["georeference"] is None
+    assert any("position in EXIF" in line for line in summary["warnings"])
 
 
 def test_images_are_one_relative_link_and_a_second_run_gives_the_same_bytes(tmp_path, problem) -> None:

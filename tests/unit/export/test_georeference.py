@@ -1,0 +1,70 @@
+"""A model's place on the earth from positions in EXIF."""
+
+import numpy as np
+import pycolmap
+import pytest
+
+from snakesfm.evaluation.alignment import Similarity, project_to_so3
+from snakesfm.export.georeference import georeference, local_origin
+
+ORIGIN = (47.0, 8.0, 500.0)
+
+
+def survey(count: int = 60, noise_m: float = 1.5, shape: tuple[float, ...] = (200.0, 100.0, 10.0)):
+    """Camera centres (N,3) of a model, what GPS says of them, and the similarity between the two."""
+    rng = np.random.default_rng(3)
+    local = (rng.random((count, 3)) - 0.5) * shape
+    turn = project_to_so3(rng.normal(size=(3, 3)))
+    truth = Similarity(37.0, turn, np.array([5.0, -8.0, 3.0]))
+    centers = (local - truth.translation) @ turn / truth.scale
+    noisy = local + rng.normal(size=local.shape) * noise_m
+    return centers, pycolmap.GPSTransform().enu_to_ellipsoid(noisy, *ORIGIN), truth
+
+
+def test_the_similarity_is_found_among_wrong_positions():
+    centers, gps, truth = survey()
+    gps[:12, :2] += 0.01
+    gps[12:15] = np.nan
+    centers[15] = np.nan
+    found = georeference(centers, gps, ORIGIN, 0)
+    assert found.trusted and found.images == 56 and 36 <= found.inliers <= 44
+    assert 1.0 < found.median_residual_m < 5.0
+    move = found.local_from_model
+    np.testing.assert_allclose(move.scale, truth.scale, rtol=0.01)
+    np.testing.assert_allclose(move.rotation, truth.rotation, atol=0.03)
+    np.testing.assert_allclose(move.translation, truth.translation, atol=1.5)
+
+
+def test_good_positions_are_not_blurred_by_bad_ones():
+    centers, gps, truth = survey(noise_m=0.02)
+    gps[:6, 2] += 8.0
+    move = georeference(centers, gps, ORIGIN, 0).local_from_model
+    np.testing.assert_allclose(
+        move.transform_points(centers),
+        survey(noise_m=0.0)[0] @ (truth.scale * truth.rotation.T) + truth.translation,
+        atol=0.05,
+    )
+
+
+@pytest.mark.parametrize(
+    ("noise_m", "shape"), [(2.0, (5.0, 5.0, 1.0)), (0.5, (200.0, 0.5, 0.5)), (0.5, (0.0, 0.0, 0.0))]
+)
+def test_an_object_smaller_than_the_error_or_a_line_is_not_trusted(noise_m, shape):
+    centers, gps, _ = survey(noise_m=noise_m, shape=shape)
+    found = georeference(centers, gps, ORIGIN, 0)
+    assert found is None or not found.trusted
+
+
+def test_few_positions_tell_nothing():
+    centers, gps, _ = survey()
+    gps[3:] = np.nan
+    assert georeference(centers, gps, ORIGIN, 0) is None
+    assert local_origin(np.full((4, 3), np.nan)) is None
+
+
+def test_the_origin_is_the_middle_and_the_result_is_that_of_the_seed():
+    centers, gps, _ = survey()
+    assert np.all(np.abs(np.array(local_origin(gps)) - ORIGIN) < (1e-3, 1e-3, 5.0))
+    first, second = (georeference(centers, gps, ORIGIN, 7).local_from_model for _ in range(2))
+    np.testing.assert_array_equal(first.rotation, second.rotation)
+    assert first.scale == second.scale
