@@ -8,6 +8,8 @@ import pycolmap
 
 from snakesfm.geometry.camera import Camera
 
+USUAL_FOCAL_RATIO = 1.2
+
 
 def filter_observations(
     reconstruction: pycolmap.Reconstruction, max_error_px: float, min_angle_deg: float, min_length: int = 2
@@ -67,6 +69,7 @@ def reset_wild_cameras(
     reconstruction: pycolmap.Reconstruction,
     cameras: Sequence[Camera],
     max_focal_change: float,
+    max_guessed_focal_change: float,
     max_distortion: float,
 ) -> list[int]:
     """Give cameras whose intrinsics left what is plausible their first ones back; the rows of these.
@@ -76,15 +79,21 @@ def reset_wild_cameras(
     reconstruction : changed in place.
     cameras : the intrinsics before any adjustment.
     max_focal_change : factor up or down.
-    max_distortion : largest absolute value of a distortion parameter.
+    max_guessed_focal_change : the same where nothing was known of the focal length.
+    max_distortion : largest absolute value of a distortion parameter of a view as wide as the default one.
     """
     wild = []
     for row, start in enumerate(cameras):
         camera = reconstruction.camera(row + 1)
-        change = camera.mean_focal_length() / start.focal_px
-        extra = [abs(camera.params[k]) for k in camera.extra_params_idxs()]
-        allowed = max(max_distortion, *(abs(p) for p in start.params[-len(extra) :])) if extra else 0.0
-        if not 1 / max_focal_change <= change <= max_focal_change or max(extra, default=0.0) > allowed:
+        focal = camera.mean_focal_length()
+        change = focal / start.focal_px
+        most = max_guessed_focal_change if start.source == "default" else max_focal_change
+        # distortion counts in squared tangents, which are small in a narrow view
+        narrow = max(1.0, focal / (USUAL_FOCAL_RATIO * max(start.width, start.height))) ** 2
+        extra = camera.extra_params_idxs()
+        distortion = max((abs(camera.params[k]) for k in extra), default=0.0)
+        allowed = max([max_distortion * narrow, *(abs(start.params[k]) for k in extra)])
+        if not 1 / most <= change <= most or distortion > allowed:
             camera.params = list(start.params)
             wild.append(row)
     return wild

@@ -50,6 +50,7 @@ class RoundSettings:
     min_principal_point_offset: float = 0.004
     max_principal_point_offset: float = 0.02
     max_focal_change: float = 3.0
+    max_guessed_focal_change: float = 15.0
     max_distortion: float = 1.0
     complete_tracks: bool = True
     complete_error_px: float = 4.0
@@ -209,7 +210,11 @@ class _Mapper:
         drop_short_tracks(self.reconstruction, settings.min_track_length)
         costs = self.solve(solving, final)
         wild = reset_wild_cameras(
-            self.reconstruction, self.cameras, settings.max_focal_change, settings.max_distortion
+            self.reconstruction,
+            self.cameras,
+            settings.max_focal_change,
+            settings.max_guessed_focal_change,
+            settings.max_distortion,
         )
         if wild:
             held = solving.constant_cameras | {row + 1 for row in wild}

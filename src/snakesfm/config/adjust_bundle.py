@@ -63,8 +63,11 @@ class AdjustBundleOptions(StageOptions):
     max_focal_change: float = Field(default=3.0, gt=1.0)
     """Factor by which a focal length may change before the camera is reset and held in the pass."""
 
+    max_guessed_focal_change: float = Field(default=15.0, gt=1.0)
+    """The same where neither EXIF nor the matches told the focal length, as for a long lens."""
+
     max_distortion: float = Field(default=1.0, gt=0.0)
-    """Largest distortion parameter before the camera is reset and held in the pass."""
+    """Largest distortion parameter before the camera is reset and held; larger in a narrow view."""
 
     complete_tracks: bool = True
     """Between rounds, add observations to points, merge points, and make points of left-out matches."""

@@ -67,7 +67,7 @@ def test_a_camera_gone_wild_is_free_again_in_the_next_pass(passes, monkeypatch):
 
     def once(reconstruction, cameras, *limits):
         calls.append(limits)
-        return reset(reconstruction, cameras, *((1.01, 1.0) if len(calls) == 1 else limits))
+        return reset(reconstruction, cameras, *((1.01, 1.01, 1.0) if len(calls) == 1 else limits))
 
     monkeypatch.setattr(rounds, "reset_wild_cameras", once)
     params = adjusted()

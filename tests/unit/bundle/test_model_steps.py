@@ -118,19 +118,23 @@ def test_weak_images_are_taken_out():
 
 
 @pytest.mark.parametrize(
-    ("params", "wild"),
+    ("params", "source", "wild"),
     [
-        ((500.0, 320.0, 240.0, 0.1), []),
-        ((1600.0, 320.0, 240.0, 0.1), [0]),
-        ((500.0, 320.0, 240.0, -1.5), [0]),
+        ((500.0, 320.0, 240.0, 0.1), "exif", []),
+        ((1600.0, 320.0, 240.0, 0.1), "exif", [0]),
+        ((1600.0, 320.0, 240.0, 0.1), "default", []),
+        ((7600.0, 320.0, 240.0, 0.1), "default", [0]),
+        ((500.0, 320.0, 240.0, -1.5), "default", [0]),
+        ((5000.0, 320.0, 240.0, -30.0), "default", []),
+        ((5000.0, 320.0, 240.0, -50.0), "default", [0]),
     ],
 )
-def test_wild_cameras_are_reset(params, wild):
+def test_wild_cameras_are_reset(params, source, wild):
     made = problem()
-    start = Camera("SIMPLE_RADIAL", 640, 480, (500.0, 320.0, 240.0, 0.0))
+    start = Camera("SIMPLE_RADIAL", 640, 480, (500.0, 320.0, 240.0, 0.0), source)
     model = replace(model_of(made), cameras=(replace(start, params=params),))
     reconstruction = to_reconstruction(model, made.keypoints, NAMES)
-    assert reset_wild_cameras(reconstruction, [start], 3.0, 1.0) == wild
+    assert reset_wild_cameras(reconstruction, [start], 3.0, 15.0, 1.0) == wild
     if wild:
         assert tuple(reconstruction.camera(1).params) == start.params
 
