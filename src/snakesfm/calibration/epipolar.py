@@ -11,7 +11,7 @@ from snakesfm.two_view.sampson import robust_sigma_px
 
 Array = NDArray[Any]
 MAX_POINTS = 400
-# most pairs that need more are wrong ones, which take half of the time and tell nothing
+# pairs that draw more are seldom usable and take most of the time
 MAX_HYPOTHESES = 500
 
 
