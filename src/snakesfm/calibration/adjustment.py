@@ -9,7 +9,16 @@ import cv2
 import numpy as np
 import poselib
 from numpy.typing import NDArray
+from scipy.sparse import coo_array, diags_array
+from scipy.sparse.linalg import splu
 
+from snakesfm.calibration.condensed import (
+    NOISE_FLOOR_PX,
+    CondensedPairs,
+    EssentialFit,
+    fit_essential,
+    reduced_equations,
+)
 from snakesfm.calibration.epipolar import EpipolarPair
 from snakesfm.two_view.estimators import poselib_camera
 from snakesfm.two_view.sampson import (
@@ -22,10 +31,12 @@ from snakesfm.two_view.sampson import (
 
 Array = NDArray[Any]
 ITERATIONS = 15
-NOISE_FLOOR_PX = 0.2
+# from focal lengths that condensed pairs agree on
+FINAL_ITERATIONS = 3
 PAIR_SIGMA = 0.02
 AGREEMENT = 2.0
 LOG_STEP = 1e-4
+SMALL_LOG_STEP = 1e-3
 MIN_STRENGTH = 2.0
 MAX_LOG_STEP = 0.25
 # at most so many points tell which of four poses has them in front of both cameras
@@ -74,39 +85,97 @@ def adjust_focals(
     tells the focal lengths as well as its geometry allows: pairs that cannot tell (forward motion, fixation
     on one point) have little weight by themselves. A pair that contradicts the others is weighted down.
     """
+    poses = list(each(lambda pair: pose_of(pair, focals), pairs))
+
+    def linearise(focals: Array) -> tuple[Array, Array]:
+        found = list(each(partial(_linearised, focals=focals), zip(pairs, poses, strict=True)))
+        poses[:] = [pose for pose, _, _ in found]
+        h = np.array([h for _, h, _ in found]).reshape(-1, 2, 2)
+        return h, np.array([b for _, _, b in found]).reshape(-1, 2)
+
+    cameras = np.array([(pair.camera_i, pair.camera_j) for pair in pairs], dtype=np.int64).reshape(-1, 2)
+    return _solve(cameras, linearise, focals, free, prior, prior_sigma, FINAL_ITERATIONS)
+
+
+def adjust_condensed(
+    pairs: CondensedPairs, focals: Array, free: Array, prior: Array, prior_sigma: Array
+) -> Array:
+    """As :func:`adjust_focals` on condensed pairs: the focal lengths (C,) alone."""
+    fit: EssentialFit | None = None
+
+    def linearise(focals: Array) -> tuple[Array, Array]:
+        nonlocal fit
+        units = focals[pairs.cameras] / pairs.scales[:, None]
+        fit = fit_essential(pairs, units[:, None], fit, 2 if fit is None else 1)
+        return reduced_equations(units, fit)
+
+    return _solve(pairs.cameras, linearise, focals, free, prior, prior_sigma, ITERATIONS).focals
+
+
+def _solve(
+    cameras: Array,
+    linearise: Callable[[Array], tuple[Array, Array]],
+    focals: Array,
+    free: Array,
+    prior: Array,
+    prior_sigma: Array,
+    iterations: int,
+) -> FocalAdjustment:
+    """Iterate on the equations (P,2,2), (P,2) of ``cameras`` (P,2) that ``linearise`` gives."""
     count = len(focals)
     logs, prior_logs = np.log(np.asarray(focals, dtype=np.float64)), np.log(prior)
-    poses = list(each(lambda pair: pose_of(pair, focals), pairs))
     held = ~np.asarray(free, dtype=bool)
-    information, strengths = np.zeros((count, count)), np.zeros((len(pairs), 2))
-    for _ in range(ITERATIONS):
-        H, g = np.diag(prior_sigma**-2.0), (logs - prior_logs) * prior_sigma**-2.0
-        linearise = partial(_linearised, focals=np.exp(logs), held=held)
-        found = list(each(linearise, zip(pairs, poses, strict=True)))
-        poses = [pose for pose, _ in found]
-        for row, (pair, (_, (h, b, distance))) in enumerate(zip(pairs, found, strict=True)):
-            weight = 1.0 / (1.0 + (distance / AGREEMENT) ** 2)
-            strengths[row] = distance, np.sqrt(np.max(np.diag(h)))
-            ends = [pair.camera_i, pair.camera_j]
-            np.add.at(H, np.ix_(ends, ends), weight * h)
-            np.add.at(g, ends, weight * b)
-        H[held] = 0.0
-        H[:, held] = 0.0
-        H[held, held] = 1.0
+    rows, columns = np.repeat(cameras, 2, axis=1).ravel(), np.tile(cameras, 2).ravel()
+    for _ in range(iterations):
+        h, b, distances = _capped(*_in_cameras(*linearise(np.exp(logs)), cameras, held))
+        weights = 1.0 / (1.0 + (distances / AGREEMENT) ** 2)
+        values = (weights[:, None, None] * h).ravel()
+        diagonal = np.where(held, 1.0, prior_sigma**-2.0)
+        H = coo_array((values, (rows, columns)), shape=(count, count)).tocsc() + diags_array(
+            diagonal, format="csc"
+        )
+        g = (logs - prior_logs) * prior_sigma**-2.0
+        g += np.bincount(cameras.ravel(), (weights[:, None] * b).ravel(), minlength=count)
         g[held] = 0.0
-        information = H
-        step = np.clip(-np.linalg.solve(H, g), -MAX_LOG_STEP, MAX_LOG_STEP)
+        step = np.clip(-splu(H).solve(g), -MAX_LOG_STEP, MAX_LOG_STEP)
         logs = logs + step
-        if np.max(np.abs(step), initial=0.0) < 1e-4:
+        if np.max(np.abs(step), initial=0.0) < SMALL_LOG_STEP:
             break
-    agreeing = np.zeros(count, dtype=np.int32)
-    for row, pair in enumerate(pairs):
-        if strengths[row, 0] < 2.0 * AGREEMENT and strengths[row, 1] > MIN_STRENGTH:
-            for camera in {pair.camera_i, pair.camera_j}:
-                agreeing[camera] += 1
-    sigmas = np.sqrt(np.diag(np.linalg.inv(information))) * ~held
-    disagreement = float(np.median(strengths[:, 0])) if len(pairs) else 0.0
-    return FocalAdjustment(np.exp(logs), sigmas, agreeing, disagreement)
+    strengths = np.sqrt(np.max(np.diagonal(h, axis1=1, axis2=2), axis=1))
+    agrees = (distances < 2.0 * AGREEMENT) & (strengths > MIN_STRENGTH)
+    first, second = cameras[agrees].T
+    agreeing = np.bincount(first, minlength=count)
+    agreeing += np.bincount(second[first != second], minlength=count)
+    sigmas = np.sqrt(np.diag(np.linalg.inv(H.toarray()))) * ~held
+    disagreement = float(np.median(distances)) if len(cameras) else 0.0
+    return FocalAdjustment(np.exp(logs), sigmas, agreeing.astype(np.int32), disagreement)
+
+
+def _in_cameras(h: Array, b: Array, cameras: Array, held: Array) -> tuple[Array, Array]:
+    """Equations of pairs in their two focal lengths, in one where both are the same, none held."""
+    free = ~held[cameras]
+    h = h * free[:, :, None] * free[:, None, :]
+    b = b * free
+    same = cameras[:, 0] == cameras[:, 1]
+    first = np.array([1.0, 0.0])
+    h[same] = h[same].sum(axis=(1, 2))[:, None, None] * np.outer(first, first)
+    b[same] = b[same].sum(axis=1)[:, None] * first
+    return h, b
+
+
+def _capped(h: Array, b: Array) -> tuple[Array, Array, Array]:
+    """Equations (P,2,2), (P,2) with a systematic error, and lengths (P,) of the pairs' own steps in sigmas.
+
+    A pair is never trusted beyond a relative standard deviation of 2 %, for lens distortion and an offset
+    principal point bias all of its points alike.
+    """
+    # covariance of the two plus a systematic part, inverted: h (1 + s^2 h)^-1
+    shrink = np.linalg.inv(np.eye(2) + PAIR_SIGMA**2 * h)
+    h, b = h @ shrink, (shrink.transpose(0, 2, 1) @ b[..., None])[..., 0]
+    h = 0.5 * (h + h.transpose(0, 2, 1))
+    own = np.linalg.solve(h + 1e-9 * np.eye(2), b[..., None])
+    squares = (own.transpose(0, 2, 1) @ h @ own)[:, 0, 0]
+    return h, b, np.sqrt(np.maximum(squares, 0.0))
 
 
 def correspondences_of(pair: EpipolarPair, focal_i: float, focal_j: float) -> Correspondences:
@@ -152,45 +221,31 @@ def refined_pose(pair: EpipolarPair, pose: tuple[Array, Array], focals: Array) -
 
 
 def _linearised(
-    start: tuple[EpipolarPair, tuple[Array, Array]], focals: Array, held: Array
-) -> tuple[tuple[Array, Array], tuple[Array, Array, float]]:
+    start: tuple[EpipolarPair, tuple[Array, Array]], focals: Array
+) -> tuple[tuple[Array, Array], Array, Array]:
     """The best pose of a pair from a nearby one, and what :func:`_reduced` gives there."""
     pair, pose = start
     pose = refined_pose(pair, pose, focals)
-    return pose, _reduced(pair, pose, focals, held)
+    return pose, *_reduced(pair, pose, focals)
 
 
-def _reduced(
-    pair: EpipolarPair, pose: tuple[Array, Array], focals: Array, held: Array
-) -> tuple[Array, Array, float]:
-    """Normal equations (2,2), (2,) of the log focals without the pose; length of the pair's own step.
-
-    The noise of the points is measured; a pair is never trusted beyond a relative standard deviation of
-    2 %, for lens distortion and an offset principal point bias all of its points alike.
-    """
+def _reduced(pair: EpipolarPair, pose: tuple[Array, Array], focals: Array) -> tuple[Array, Array]:
+    """Normal equations (2,2), (2,) of the log focals without the pose, by the noise of the points."""
     focal_i, focal_j = float(focals[pair.camera_i]), float(focals[pair.camera_j])
     errors, by_pose = sampson_jacobian(correspondences_of(pair, focal_i, focal_j), *pose)
     sigma = robust_sigma_px(errors, NOISE_FLOOR_PX)
     weights = cauchy_weights(errors, 2.0 * sigma) / sigma**2
-    up, down = np.exp(LOG_STEP), np.exp(-LOG_STEP)
+    up = np.exp(LOG_STEP)
     by_focal = np.column_stack(
         [
             sampson_errors_px(correspondences_of(pair, focal_i * a, focal_j * b), *pose)
             - sampson_errors_px(correspondences_of(pair, focal_i / a, focal_j / b), *pose)
             for a, b in ((up, 1.0), (1.0, up))
         ]
-    ) / (np.log(up) - np.log(down))
-    if pair.camera_i == pair.camera_j:
-        by_focal = np.column_stack([by_focal.sum(axis=1), np.zeros(len(errors))])
-    by_focal = by_focal * ~held[[pair.camera_i, pair.camera_j]]
+    ) / (2.0 * LOG_STEP)
     A = by_pose.T @ (weights[:, None] * by_pose)
     A += 1e-9 * np.trace(A) * np.eye(5)
     B = by_pose.T @ (weights[:, None] * by_focal)
     solved = np.linalg.solve(A, np.column_stack([B, by_pose.T @ (weights * errors)]))
     h = by_focal.T @ (weights[:, None] * by_focal) - B.T @ solved[:, :2]
-    b = by_focal.T @ (weights * errors) - B.T @ solved[:, 2]
-    # covariance of the two plus a systematic part, inverted: h (1 + s^2 h)^-1
-    shrink = np.linalg.inv(np.eye(2) + PAIR_SIGMA**2 * h)
-    h, b = h @ shrink, shrink.T @ b
-    own = np.linalg.lstsq(h + 1e-9 * np.eye(2), b, rcond=None)[0]
-    return 0.5 * (h + h.T), b, float(np.sqrt(max(own @ h @ own, 0.0)))
+    return h, by_focal.T @ (weights * errors) - B.T @ solved[:, 2]

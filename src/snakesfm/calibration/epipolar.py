@@ -11,6 +11,8 @@ from snakesfm.two_view.sampson import robust_sigma_px
 
 Array = NDArray[Any]
 MAX_POINTS = 400
+# pairs that draw more are seldom usable and take most of the time
+MAX_HYPOTHESES = 500
 
 
 @dataclass(frozen=True)
@@ -46,14 +48,20 @@ def estimate_epipolar_pair(
 
     Parameters
     ----------
-    points_i, points_j : (M,2) matched points in pixels from each principal point.
+    points_i, points_j : (M,2) matched points in pixels from each principal point, best first.
     max_error_px : epipolar error of an inlier; twice this is allowed to a homography.
     planar_ratio : the pair is refused where a homography explains this share of the inliers.
     """
     F, info = poselib.estimate_fundamental(
         points_i,
         points_j,
-        {"max_epipolar_error": max_error_px, "min_iterations": 100, "max_iterations": 5000, "seed": seed},
+        {
+            "max_epipolar_error": max_error_px,
+            "min_iterations": 100,
+            "max_iterations": MAX_HYPOTHESES,
+            "progressive_sampling": True,
+            "seed": seed,
+        },
         {"loss_type": "CAUCHY", "loss_scale": 0.5 * max_error_px},
     )
     inliers = np.array(info["inliers"], dtype=bool)
@@ -73,6 +81,17 @@ def estimate_epipolar_pair(
         points_i, points_j = points_i[rows], points_j[rows]
     noise_px = robust_sigma_px(_sampson_errors(F, points_i, points_j), 0.0)
     return EpipolarPair(camera_i, camera_j, points_i, points_j, F / np.linalg.norm(F), noise_px)
+
+
+def rows_of_cameras(cameras: Array, count: int) -> list[Array]:
+    """Rows of the pairs of cameras (P,2) that each of ``count`` cameras is in, ascending."""
+    rows = np.arange(len(cameras))
+    other = cameras[:, 0] != cameras[:, 1]
+    ends = np.concatenate([cameras[:, 0], cameras[other, 1]])
+    rows = np.concatenate([rows, rows[other]])
+    order = np.lexsort([rows, ends])
+    starts = np.searchsorted(ends[order], np.arange(1, count))
+    return np.split(rows[order], starts)
 
 
 def _sampson_errors(F: Array, points_i: Array, points_j: Array) -> Array:

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from snakesfm.calibration.adjustment import Each, FocalAdjustment, adjust_focals
+from snakesfm.calibration.adjustment import Each, FocalAdjustment, adjust_condensed, adjust_focals
+from snakesfm.calibration.condensed import condense_pairs
 from snakesfm.calibration.epipolar import EpipolarPair, estimate_epipolar_pair
 from snakesfm.calibration.profiles import scan_focals
 from snakesfm.calibration.votes import vote_focals
@@ -26,7 +27,7 @@ CONTRADICTION_SIGMAS = 3.0
 
 @dataclass(frozen=True)
 class MatchedPair:
-    """Matched keypoints (M,2) float32 in pixels of two images, the rows of their cameras, and a seed."""
+    """Matched keypoints (M,2) float32 in pixels of two images, best first, rows of the cameras, a seed."""
 
     camera_i: int
     camera_j: int
@@ -144,10 +145,12 @@ def _adjust(
 ) -> FocalAdjustment:
     # the prior only keeps focal lengths that no pair tells in their place
     weak = np.full(len(prior), options.default_sigma)
+    condensed = condense_pairs(pairs)
     start = vote_focals(pairs, prior, free, low, high)
     if len(prior) > 1:
-        start = adjust_focals(pairs, start, free, prior, weak, each).focals
-    start = scan_focals(pairs, np.clip(start, low, high), free, low, high, each)
+        start = adjust_condensed(condensed, start, free, prior, weak)
+    start = scan_focals(condensed, np.clip(start, low, high), free, low, high)
+    start = adjust_condensed(condensed, start, free, prior, weak)
     return adjust_focals(pairs, start, free, prior, weak, each)
 
 

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from snakesfm.calibration.epipolar import EpipolarPair
+from snakesfm.calibration.epipolar import EpipolarPair, rows_of_cameras
 
 Array = NDArray[Any]
 GRID_SIZE = 60
@@ -17,13 +17,18 @@ VOTE_SCALE = 0.02
 def essential_defect(F: Array, focal_i: Array, focal_j: Array) -> Array:
     """How far K_j^T F K_i is from an essential matrix, 0 (is one) to 1.
 
-    The difference of the two larger singular values over their sum, for F (3,3) and focal lengths (G,).
+    The difference of the two larger singular values over their sum, for F (...,3,3) of rank 2 and focal
+    lengths (...,G).
     """
-    E = np.broadcast_to(F, (*np.shape(focal_i), 3, 3)).copy()
-    E[..., :2, :] *= np.asarray(focal_j)[..., None, None]
-    E[..., :, :2] *= np.asarray(focal_i)[..., None, None]
-    values = np.linalg.svd(E, compute_uv=False)
-    defect: Array = (values[..., 0] - values[..., 1]) / (values[..., 0] + values[..., 1])
+    F = np.asarray(F) / np.linalg.norm(F, axis=(-2, -1), keepdims=True)
+    one = np.ones(np.shape(focal_i))
+    rows, columns = (np.stack([np.square(f), np.square(f), one], axis=-1) for f in (focal_j, focal_i))
+    squares = np.einsum("...ab,...ga,...gb->...g", F**2, rows, columns)
+    # of a matrix of rank 2, the norm of the cofactors is the product of the singular values
+    cofactors = np.stack([np.cross(F[..., k - 2, :], F[..., k - 1, :]) for k in range(3)], axis=-2)
+    rows, columns = (np.stack([f[..., 1], f[..., 1], f[..., 1] ** 2], axis=-1) for f in (rows, columns))
+    twice = 2.0 * np.sqrt(np.einsum("...ab,...ga,...gb->...g", cofactors**2, rows, columns))
+    defect: Array = np.sqrt(np.maximum(squares - twice, 0.0) / (squares + twice))
     return defect
 
 
@@ -44,22 +49,19 @@ def vote_focals(
     Source of the criterion: Mendonca and Cipolla, A simple technique for self-calibration, CVPR 1999.
     """
     focals = np.array(focals, dtype=np.float64)
-    of_camera: dict[int, list[EpipolarPair]] = {int(c): [] for c in np.nonzero(free)[0]}
-    for pair in pairs:
-        for camera in {pair.camera_i, pair.camera_j}:
-            if camera in of_camera:
-                of_camera[camera].append(pair)
+    ends = np.array([(pair.camera_i, pair.camera_j) for pair in pairs], dtype=np.int64).reshape(-1, 2)
+    F = np.array([pair.F for pair in pairs]).reshape(-1, 3, 3)
+    rows = {camera: rows for camera, rows in enumerate(rows_of_cameras(ends, len(focals))) if free[camera]}
     for _ in range(SWEEPS):
         changed = False
-        for camera, own in of_camera.items():
-            if not own:
+        for camera, own in rows.items():
+            if not len(own):
                 continue
             grid = np.geomspace(low[camera], high[camera], GRID_SIZE)
-            cost = np.zeros(GRID_SIZE)
-            for pair in own:
-                focal_i = grid if pair.camera_i == camera else np.full(GRID_SIZE, focals[pair.camera_i])
-                focal_j = grid if pair.camera_j == camera else np.full(GRID_SIZE, focals[pair.camera_j])
-                cost += np.log1p((essential_defect(pair.F, focal_i, focal_j) / VOTE_SCALE) ** 2)
+            focal_i, focal_j = (
+                np.where(side[:, None] == camera, grid, focals[side][:, None]) for side in ends[own].T
+            )
+            cost = np.log1p((essential_defect(F[own], focal_i, focal_j) / VOTE_SCALE) ** 2).sum(axis=0)
             best = float(grid[np.argmin(cost)])
             changed |= abs(np.log(best / focals[camera])) > 1e-9
             focals[camera] = best

@@ -63,7 +63,9 @@ def _calibrate(
         if i in keypoints and j in keypoints:
             path, start, stop = places[row]
             with PairMatches.open(path) as file:
-                matches = file["matches"][start:stop]
+                # best first: the estimator draws from the first ones sooner
+                order = np.argsort(-file["scores"][start:stop], kind="stable")
+                matches = file["matches"][start:stop][order]
             pairs.append(
                 MatchedPair(
                     int(index.camera_ids[i]),

@@ -1,17 +1,27 @@
 """Focal lengths from matched pairs."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 
-from snakesfm.calibration.adjustment import adjust_focals
-from snakesfm.calibration.epipolar import estimate_epipolar_pair
+from snakesfm.calibration.adjustment import (
+    adjust_condensed,
+    adjust_focals,
+    correspondences_of,
+    pose_of,
+    refined_pose,
+)
+from snakesfm.calibration.condensed import condense_pairs, fit_essential
+from snakesfm.calibration.epipolar import EpipolarPair, estimate_epipolar_pair, rows_of_cameras
 from snakesfm.calibration.focal import MatchedPair, calibrate_focals, choose_pairs
+from snakesfm.calibration.profiles import scan_focals
 from snakesfm.calibration.votes import essential_defect, vote_focals
 from snakesfm.config.calibrate_cameras import CalibrateCamerasOptions
 from snakesfm.geometry.camera import Camera
 from snakesfm.geometry.rotations import exp_so3
+from snakesfm.two_view.sampson import cauchy_cost, sampson_errors_px
 
 Array = np.ndarray[Any, Any]
 OPTIONS = CalibrateCamerasOptions()
@@ -140,3 +150,60 @@ def test_chosen_pairs_are_strong_bounded_and_spread() -> None:
     assert len(choose_pairs(pairs, counts, np.zeros(images, dtype=int), np.array([True]), 30, 5000)) == 0
     own = choose_pairs(pairs, counts, np.arange(images), np.ones(images, dtype=bool), 2, 40)
     assert 100 <= len(own) <= 200
+
+
+def epipolar_pairs(focal: float, count: int) -> list[EpipolarPair]:
+    pairs = [view_pair(400 + k, focal, focal) for k in range(count)]
+    found = [
+        estimate_epipolar_pair(0, 0, p.points_i - CENTER, p.points_j - CENTER, 1.0, 0.8, p.seed)
+        for p in pairs
+    ]
+    return [pair for pair in found if pair is not None]
+
+
+def test_defect_is_that_of_the_singular_values() -> None:
+    pair = view_pair(1, 900, 1300)
+    found = estimate_epipolar_pair(0, 1, pair.points_i - CENTER, pair.points_j - CENTER, 1.0, 0.8, 0)
+    assert found is not None
+    focal_i, focal_j = np.array([300.0, 900.0, 4000.0]), np.array([2000.0, 1300.0, 500.0])
+    for defect, i, j in zip(essential_defect(found.F, focal_i, focal_j), focal_i, focal_j, strict=True):
+        values = np.linalg.svd(np.diag([j, j, 1.0]) @ found.F @ np.diag([i, i, 1.0]), compute_uv=False)
+        assert defect == pytest.approx((values[0] - values[1]) / (values[0] + values[1]), abs=1e-7)
+
+
+def test_condensed_form_is_the_sum_of_weighted_squared_errors() -> None:
+    (pair,) = epipolar_pairs(900.0, 1)
+    focals = np.array([1000.0])
+    condensed = condense_pairs([replace(pair, points_i=pair.points_i[:100], points_j=pair.points_j[:100])])
+    units = np.full((1, 1, 2), 1000.0) / condensed.scales
+    fit = fit_essential(condensed, units, rounds=4)
+    pose = refined_pose(pair, pose_of(pair, focals), focals)
+    points = correspondences_of(pair, 1000.0, 1000.0).take(np.arange(100))
+    errors = sampson_errors_px(points, *pose)
+    exact = 4.0 * cauchy_cost(errors, 2.0 * condensed.sigmas[0])
+    # the pose refined on all points with another loss is not better for these
+    assert 0.5 * exact < fit.costs[0, 0] < 1.02 * exact
+
+
+def test_condensed_pairs_lead_to_nearly_the_adjusted_focal_length() -> None:
+    pairs = epipolar_pairs(900.0, 8)
+    start, free, sigma = np.array([1000.0]), np.array([True]), np.array([0.5])
+    condensed = adjust_condensed(condense_pairs(pairs), start, free, start, sigma)
+    adjusted = adjust_focals(pairs, condensed, free, start, sigma).focals
+    assert 1e-9 < abs(condensed[0] / adjusted[0] - 1.0) < 0.01
+    assert abs(adjusted[0] / 900.0 - 1.0) < 0.02
+    scanned = scan_focals(condense_pairs(pairs), np.array([3000.0]), free, start / 3, start * 6)
+    assert 0.75 < scanned[0] / 900.0 < 1.33
+
+
+def test_no_usable_pair_leaves_the_start() -> None:
+    start, free = np.array([1000.0, 500.0]), np.array([True, True])
+    condensed = condense_pairs([])
+    assert adjust_condensed(condensed, start, free, start, 0.5 * np.ones(2)) == pytest.approx(start)
+    np.testing.assert_array_equal(scan_focals(condensed, start, free, start / 2, start * 2), start)
+
+
+def test_rows_of_cameras_name_each_pair_once() -> None:
+    cameras = np.array([[0, 1], [2, 2], [0, 2], [1, 0]])
+    found = [rows.tolist() for rows in rows_of_cameras(cameras, 4)]
+    assert found == [[0, 2, 3], [0, 3], [1, 2], []]
