@@ -270,7 +270,7 @@ class ScenePlan:
             return min(len(lines), everything)
         # a similar image is mostly found from one side alone
         per_image = options.look_ahead * ("sequential" in options.method)
-        per_image += int(options.top_k) * options.needs_descriptors
+        per_image += int(options.top_k) * (options.needs_descriptors or "spatial" in options.method)
         return min(images * per_image, everything)
 
     def load(self, stage: str) -> Load:

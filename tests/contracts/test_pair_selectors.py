@@ -4,7 +4,13 @@ import numpy as np
 import pytest
 
 from snakesfm.retrieval.listed import listed_pairs
-from snakesfm.retrieval.pairs import REASONS, exhaustive_pairs, sequential_pairs, similar_pairs
+from snakesfm.retrieval.pairs import (
+    REASONS,
+    exhaustive_pairs,
+    sequential_pairs,
+    similar_pairs,
+    spatial_pairs,
+)
 
 
 class PairSelectorContract:
@@ -66,6 +72,13 @@ class TestRetrieval(PairSelectorContract):
         vectors = np.random.default_rng(1).normal(size=(count, 16)) + 2
         vectors /= np.linalg.norm(vectors, axis=1, keepdims=True)
         return similar_pairs([np.arange(count)], lambda block: vectors.astype(np.float32), 3, 0.0)
+
+
+class TestSpatial(PairSelectorContract):
+    reason = "spatial"
+
+    def select(self, count):
+        return spatial_pairs(np.random.default_rng(2).random((count, 2)) * 100.0, 3)
 
 
 class TestListed(PairSelectorContract):

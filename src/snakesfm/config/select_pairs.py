@@ -14,10 +14,17 @@ class SelectPairsOptions(StageOptions):
 
     stage_version: ClassVar[int] = 1
 
-    method: Literal["auto", "exhaustive", "sequential", "retrieval", "sequential+retrieval", "listed"] = (
-        "auto"
-    )
-    """All pairs, neighbours in the order of names, similar images, both, or a list's; 'auto' decides."""
+    method: Literal[
+        "auto",
+        "exhaustive",
+        "sequential",
+        "retrieval",
+        "spatial",
+        "sequential+retrieval",
+        "sequential+spatial",
+        "listed",
+    ] = "auto"
+    """All pairs, neighbours by name, similar images, neighbours by GPS, or a list's; 'auto' decides."""
 
     exhaustive_up_to: int = Field(500, ge=2, le=100_000)
     """Number of images up to which 'auto' takes all pairs, and sequential+retrieval beyond."""
@@ -26,7 +33,7 @@ class SelectPairsOptions(StageOptions):
     """How many following images, in the natural order of names, an image is paired with by 'sequential'."""
 
     top_k: int | Literal["auto"] = "auto"
-    """How many similar images 'retrieval' pairs an image with; 'auto' is 15, and 30 from 500 images on."""
+    """How many similar or near images an image is paired with; 'auto' is 15, and 30 from 500 images on."""
 
     min_score: float = Field(0.0, ge=-1.0, le=1.0)
     """Least similarity of a pair chosen by 'retrieval'."""

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from snakesfm.evaluation.alignment import Similarity
 from snakesfm.geometry.colmap_binding import pycolmap
+from snakesfm.geometry.earth import Origin, local_metres
 
 Array = NDArray[Any]
 
@@ -35,7 +36,7 @@ class Georeference:
     spread_m : standard deviations (3,) of EXIF's positions along their principal axes, the largest first.
     """
 
-    origin: tuple[float, float, float]
+    origin: Origin
     local_from_model: Similarity
     images: int
     inliers: int
@@ -61,23 +62,7 @@ class Georeference:
         }
 
 
-def local_origin(gps: Array) -> tuple[float, float, float] | None:
-    """The median position of all images that have one, None where none has.
-
-    Parameters
-    ----------
-    gps : (N,3) latitude and longitude in degrees, altitude in metres; NaN where unknown.
-    """
-    known = gps[np.isfinite(gps).all(axis=1)]
-    if not len(known):
-        return None
-    latitude, longitude, altitude = np.median(known, axis=0).tolist()
-    return latitude, longitude, altitude
-
-
-def georeference(
-    centers: Array, gps: Array, origin: tuple[float, float, float], seed: int
-) -> Georeference | None:
+def georeference(centers: Array, gps: Array, origin: Origin, seed: int) -> Georeference | None:
     """The similarity that takes camera centres to the positions in EXIF, or None where too few have one.
 
     Parameters
@@ -92,7 +77,7 @@ def georeference(
     known = np.isfinite(gps).all(axis=1) & np.isfinite(centers).all(axis=1)
     if known.sum() < LEAST_IMAGES:
         return None
-    places = pycolmap.GPSTransform().ellipsoid_to_enu(gps[known], *origin)
+    places = local_metres(gps[known], origin)
     sources, max_error = centers[known], COARSE_ERROR_M
     found = None
     for _ in range(2):

@@ -13,7 +13,7 @@ Array = NDArray[Any]
 
 HELD_BYTES = 1 << 29
 
-REASONS = ("exhaustive", "sequential", "retrieved", "listed")
+REASONS = ("exhaustive", "sequential", "retrieved", "listed", "spatial")
 
 
 @dataclass(frozen=True)
@@ -84,6 +84,28 @@ def sequential_pairs(names: Sequence[str], look_ahead: int) -> PairTable:
     steps = range(1, min(look_ahead, len(names) - 1) + 1)
     pairs = [np.column_stack([order[:-step], order[step:]]) for step in steps]
     return PairTable.of(np.concatenate(pairs) if pairs else np.zeros((0, 2)), "sequential")
+
+
+def spatial_pairs(positions: Array, nearest: int) -> PairTable:
+    """Every image with those that were taken nearest to it.
+
+    Parameters
+    ----------
+    positions : (N,D) in metres, NaN where unknown; such images get no pairs.
+    nearest : how many; an image may be chosen by more.
+    """
+    # loaded here, as the other choices do without
+    from scipy.spatial import cKDTree
+
+    known = np.flatnonzero(np.isfinite(positions).all(axis=1))
+    count = min(nearest, len(known) - 1)
+    if count < 1:
+        return PairTable.of(np.zeros((0, 2)), "spatial")
+    # pictures taken at one place are all at distance 0, and the image itself need not come first
+    _, rows = cKDTree(positions[known]).query(positions[known], k=count + 1)
+    partners = np.where(rows == np.arange(len(known))[:, None], -1, rows)
+    image, slot = np.nonzero(partners >= 0)
+    return PairTable.of(np.column_stack([known[image], known[partners[image, slot]]]), "spatial")
 
 
 def similar_pairs(

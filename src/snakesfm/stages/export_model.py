@@ -15,11 +15,12 @@ from snakesfm.export.colmap import (
     registered_images,
     summarize,
 )
-from snakesfm.export.georeference import Georeference, georeference, local_origin
+from snakesfm.export.georeference import Georeference, georeference
 from snakesfm.export.image_folder import place_images
 from snakesfm.export.nerfstudio import camera_warnings, transforms
 from snakesfm.export.undistorted import write_undistorted
 from snakesfm.geometry.camera import Camera, cameras_from_columns
+from snakesfm.geometry.earth import local_origin
 from snakesfm.geometry.poses import center_of, translation_of
 from snakesfm.stages.job import StageJob
 

@@ -2,20 +2,30 @@
 
 import itertools
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from snakesfm.artifacts.features import GlobalDescriptors
 from snakesfm.artifacts.images import ImageIndex
 from snakesfm.artifacts.pairs import ImagePairs
 from snakesfm.errors import ConfigError
+from snakesfm.geometry.earth import local_metres, local_origin
 from snakesfm.retrieval.listed import listed_pairs
-from snakesfm.retrieval.pairs import PairTable, exhaustive_pairs, sequential_pairs, similar_pairs
+from snakesfm.retrieval.pairs import (
+    PairTable,
+    exhaustive_pairs,
+    sequential_pairs,
+    similar_pairs,
+    spatial_pairs,
+)
 from snakesfm.stages.job import StageJob
 
 if TYPE_CHECKING:
     from snakesfm.config.select_pairs import SelectPairsOptions
+
+Array = NDArray[Any]
 
 
 def run(job: StageJob) -> None:
@@ -52,9 +62,29 @@ def _choose(job: StageJob, index: ImageIndex, options: "SelectPairsOptions", pai
     table = PairTable.of(np.zeros((0, 2)), "sequential")
     if "sequential" in options.method:
         table = table.union(sequential_pairs(names, options.look_ahead))
+    if "spatial" in options.method:
+        table = table.union(spatial_pairs(_local_places(index), int(options.top_k)))
     if "retrieval" in options.method:
         table = table.union(_retrieve(job.paths("descriptors"), options, job.threads))
     return table
+
+
+def _local_places(index: ImageIndex) -> Array:
+    """Metres east and north (N,2) of the images, NaN where EXIF does not tell.
+
+    Height is left out: EXIF often has it from another zero, or not at all.
+    """
+    places = np.column_stack([index.gps[:, :2], np.zeros(len(index.gps))])
+    origin = local_origin(places)
+    if origin is None:
+        raise ConfigError(
+            "select_pairs.method pairs images by their position, but none tells it in EXIF: "
+            "say --config 'select_pairs={method: sequential+retrieval}'."
+        )
+    without = int(np.isnan(places).any(axis=1).sum())
+    if without:
+        print(f"warning: {without} of {len(places)} images do not tell their position in EXIF")
+    return local_metres(places, origin)[:, :2]
 
 
 def _read_list(path: str, names: list[str], refused: list[str]) -> PairTable:

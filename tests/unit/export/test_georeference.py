@@ -5,7 +5,8 @@ import pycolmap
 import pytest
 
 from snakesfm.evaluation.alignment import Similarity, project_to_so3
-from snakesfm.export.georeference import georeference, local_origin
+from snakesfm.export.georeference import georeference
+from snakesfm.geometry.earth import local_origin
 
 ORIGIN = (47.0, 8.0, 500.0)
 

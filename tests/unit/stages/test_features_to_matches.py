@@ -64,7 +64,7 @@ def images(tmp_path_factory):
 class Scene:
     """The stages from index to matches, in one folder, with a number of blocks."""
 
-    def __init__(self, folder, images, blocks, shas=None):
+    def __init__(self, folder, images, blocks, shas=None, gps=None):
         self.folder, self.images, self.blocks = folder, images, blocks
         count = len(NAMES)
         index = ImageIndex(
@@ -75,7 +75,7 @@ class Scene:
             camera_ids=np.zeros(count, int),
             orientations=np.ones(count, int),
             focal_exif_px=np.full(count, np.nan),
-            gps=np.full((count, 3), np.nan),
+            gps=np.full((count, 3), np.nan) if gps is None else gps,
             duplicate_of=np.full(count, -1),
             camera_models=["PINHOLE"],
             camera_sizes=[[320, 240]],
@@ -267,6 +267,23 @@ def test_a_list_is_followed(dealt, tmp_path):
         dealt.select(SelectPairsOptions(method="listed"))
     with pytest.raises(ConfigError, match="cannot be read"):
         dealt.select(SelectPairsOptions(method="listed"), str(tmp_path / "missing.txt"))
+
+
+def test_neighbours_by_gps_are_those_on_the_ground(tmp_path, capsys):
+    gps = np.array([[47.0, 8.0 + 1e-4 * k, 400.0 * (k % 2)] for k in range(6)])
+    gps[2, 2], gps[5] = np.nan, np.nan
+    scene = Scene(tmp_path, tmp_path, 2, gps=gps)
+    rows = scene.select(SelectPairsOptions(method="spatial", top_k=1))
+    assert {(0, 1), (3, 4)} <= {pair for pair, _, _ in rows} <= {(a, a + 1) for a in range(4)}
+    assert {reason for _, reason, _ in rows} == {"spatial"} and "1 of 6 images" in capsys.readouterr().out
+    both = scene.select(SelectPairsOptions(method="sequential+spatial", top_k=2, look_ahead=1))
+    assert {"sequential", "sequential+spatial", "spatial"} >= {reason for _, reason, _ in both}
+    assert {(4, 5), (0, 2)} <= {pair for pair, _, _ in both}
+
+
+def test_without_gps_there_are_no_neighbours_by_it(dealt):
+    with pytest.raises(ConfigError, match=r"EXIF.*sequential[+]retrieval"):
+        dealt.select(SelectPairsOptions(method="spatial"))
 
 
 def test_matches_are_right_and_do_not_depend_on_the_blocks(whole, dealt):

@@ -1,0 +1,34 @@
+"""Positions on the earth in a local world of metres."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[Any]
+Origin = tuple[float, float, float]
+
+
+def local_origin(gps: Array) -> Origin | None:
+    """The median position of all images that have one, None where none has.
+
+    Parameters
+    ----------
+    gps : (N,3) latitude and longitude in degrees, altitude in metres, WGS84; NaN where unknown.
+    """
+    known = gps[np.isfinite(gps).all(axis=1)]
+    if not len(known):
+        return None
+    latitude, longitude, altitude = np.median(known, axis=0).tolist()
+    return latitude, longitude, altitude
+
+
+def local_metres(gps: Array, origin: Origin) -> Array:
+    """Metres east, north and up (N,3) of an origin; NaN where unknown. Parameters as in local_origin."""
+    from snakesfm.geometry.colmap_binding import pycolmap
+
+    metres = np.full(gps.shape, np.nan)
+    known = np.isfinite(gps).all(axis=1)
+    if known.any():
+        metres[known] = pycolmap.GPSTransform().ellipsoid_to_enu(gps[known], *origin)
+    return metres
