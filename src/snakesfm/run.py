@@ -14,6 +14,7 @@ from typing import Any
 from snakesfm import slurm
 from snakesfm.errors import ConfigError
 from snakesfm.plan import Plan
+from snakesfm.records import unrecorded_files
 from snakesfm.scene_plan import ScenePlan
 
 LOCK_NAME = ".snakesfm.lock"
@@ -28,6 +29,40 @@ class Run:
         self.started = time.time()
         self.lock: Any = None
         self.slurm_run = ""
+
+    def refuse_unrecorded(self) -> None:
+        """Set aside what other options or another version made and Snakemake knows nothing of.
+
+        Before the jobs are planned, so that they are planned to be made again. While another run writes to
+        the folder nothing is touched: this one will be refused.
+        """
+        if self._is_locked():
+            return
+        for scene in self.plan.scenes.values():
+            unknown = unrecorded_files(scene.all_files())
+            if not unknown:
+                continue
+            # loaded here, as most runs know their files and h5py takes a tenth of a second
+            from snakesfm.artifacts.checks import ASIDE, set_aside
+
+            found = set_aside(unknown, scene.name, scene.options_digests)
+            if found:
+                print(
+                    f"snakesfm: scene '{scene.name}': {len(found)} files of which this folder's .snakemake "
+                    f"knows nothing are renamed to *{ASIDE} and made again: {found[0]}.",
+                    flush=True,
+                )
+
+    def _is_locked(self) -> bool:
+        """Whether another run holds the output folder."""
+        try:
+            with (self.plan.output / LOCK_NAME).open(encoding="utf-8") as lock:
+                fcntl.flock(lock, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return True
+        except OSError:
+            return False
+        return False
 
     def start(self, slurm_run: str = "") -> None:
         """Take the output folder for this run; the system frees it when the run ends, however it ends.

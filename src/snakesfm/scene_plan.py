@@ -366,10 +366,11 @@ class ScenePlan:
     def upstream(self, inputs: Iterable[str]) -> dict[str, str]:
         """The options digest of every stage that made one of these files; a job checks them against it."""
         stages = {part for path in inputs for part in Path(path).parent.parts[-3:] if part in STAGES}
-        return {stage: self._options_digests[stage] for stage in sorted(stages)}
+        return {stage: self.options_digests[stage] for stage in sorted(stages)}
 
     @functools.cached_property
-    def _options_digests(self) -> dict[str, str]:
+    def options_digests(self) -> dict[str, str]:
+        """Digest of every stage's version and options."""
         options = {stage: self.options(stage) for stage in STAGES}
         return {
             stage: options_digest(value.stage_version, value.canonical_json())

@@ -22,6 +22,7 @@ from snakesfm.artifacts.images import CalibratedCameras, ImageIndex
 from snakesfm.artifacts.pairs import REJECTIONS, ImagePairs, PairMatches, TwoViewGeometries
 from snakesfm.blocks import choose_blocks, tile_names
 from snakesfm.config.configuration import options_class
+from snakesfm.config.select_pairs import SelectPairsOptions
 from snakesfm.errors import ConfigError, SnakesfmError
 from snakesfm.geometry.camera import Camera, cameras_to_columns
 from snakesfm.geometry.poses import translation_of
@@ -315,6 +316,9 @@ class Simulation:
 
     def _header(self, stage: str) -> Header:
         options = options_class(stage)().resolved()
+        if isinstance(options, SelectPairsOptions):
+            # as the configuration that is written here has them
+            options = options.model_copy(update={"method": "listed"}).resolve(self.options.images)
         return Header(stage, options.stage_version, self.scene, options.canonical_json())
 
     def _digest(self, *what: str) -> str:

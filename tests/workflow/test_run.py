@@ -114,6 +114,27 @@ def test_an_option_reaches_its_stage_and_what_follows_alone(finished, small_scen
     assert sorted(set(outcome.rules)) == sorted(MAPPING[6:])
 
 
+def test_a_folder_without_records_is_taken_over_unless_its_options_differ(
+    finished, small_scene: Path, workflow
+) -> None:
+    copy_run(finished[0], workflow.folder)
+    shutil.rmtree(workflow.folder / ".snakemake")
+    same = workflow.run(*config_of(small_scene))
+    assert same.status == 0 and same.rules == [], same.text
+    other = [*config_of(small_scene), "build_tracks={min_length: 4}"]
+    output = workflow.folder / "out" / "square"
+    before = model_bytes(output)
+    assert workflow.run("--dry-run", *other).status == 0 and model_bytes(output) == before
+    changed = workflow.run(*other)
+    assert changed.status == 0, changed.text
+    assert "1 files of which this folder's .snakemake knows nothing" in changed.text
+    assert {"build_tracks", "triangulate_tracks", "adjust_bundle", "export_model"} <= set(changed.rules)
+    assert not {"extract_features", "match_pairs", "average_rotations"} & set(changed.rules)
+    assert (output / "build_tracks" / "tracks.h5.refused").is_file()
+    again = workflow.run(*other)
+    assert again.status == 0 and again.rules == [], again.text
+
+
 def test_an_added_image_is_indexed(finished, small_scene: Path, workflow) -> None:
     copy_run(finished[0], workflow.folder)
     scene = workflow.folder / "square"

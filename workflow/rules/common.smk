@@ -21,6 +21,10 @@ try:
 except SnakesfmError as error:
     raise WorkflowError(str(error)) from None
 RUN = Run(PLAN)
+if workflow.is_main_process and not any(
+    re.fullmatch(r"--dry-?run|-[a-zA-Z]*n[a-zA-Z]*", given) for given in sys.argv[1:]
+):
+    RUN.refuse_unrecorded()
 
 IN_CONTAINER = (
     DeploymentMethod.APPTAINER in workflow.deployment_settings.deployment_method

@@ -26,17 +26,30 @@ def check_inputs(paths: Iterable[Path], scene: str, digests: Mapping[str, str]) 
     ------
     ArtifactError : at least one file was set aside.
     """
+    refused = set_aside(paths, scene, digests)
+    if refused:
+        more = f" (and {len(refused) - 1} more)" if len(refused) > 1 else ""
+        raise ArtifactError(
+            f"{refused[0]}{more}: it was renamed to *{ASIDE}; start the same command again to make it anew."
+        )
+
+
+def set_aside(paths: Iterable[Path], scene: str, digests: Mapping[str, str]) -> list[str]:
+    """Rename every artifact that is damaged or not of this scene and configuration to ``*.refused``.
+
+    Parameters as in :func:`check_inputs`.
+
+    Returns
+    -------
+    One clause per file that was renamed.
+    """
     refused = []
     for path in paths:
         reason = _reason(path, scene, digests) if path.suffix == ".h5" and path.is_file() else ""
         if reason:
             path.replace(path.with_name(path.name + ASIDE))
             refused.append(f"{path} {reason}")
-    if refused:
-        more = f" (and {len(refused) - 1} more)" if len(refused) > 1 else ""
-        raise ArtifactError(
-            f"{refused[0]}{more}: it was renamed to *{ASIDE}; start the same command again to make it anew."
-        )
+    return refused
 
 
 def _reason(path: Path, scene: str, digests: Mapping[str, str]) -> str:

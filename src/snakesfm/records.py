@@ -1,0 +1,32 @@
+"""What Snakemake noted of the files that it made."""
+
+from base64 import urlsafe_b64encode
+from collections.abc import Iterable
+from pathlib import Path
+
+RECORDS = Path(".snakemake", "metadata")
+# the longest name of a file, less the mark of a part that goes on
+PART = 254
+
+
+def unrecorded_files(outputs: Iterable[str], records: Path = RECORDS) -> list[Path]:
+    """Artifacts that are there and of which no record tells how they were made.
+
+    Snakemake compares a job's options with those that it noted in the folder it was started in. Of a file
+    that was made from another folder, or whose notes are gone, it takes any for granted.
+
+    Parameters
+    ----------
+    outputs : files as the rules name them.
+    records : Snakemake's folder of records.
+    """
+    artifacts = [output for output in outputs if output.endswith(".h5")]
+    unknown = [output for output in artifacts if not (records / _record_name(output)).is_file()]
+    return [path for path in map(Path, unknown) if path.is_file()]
+
+
+def _record_name(output: str) -> str:
+    """The file in which Snakemake 9 notes how an output was made."""
+    name = urlsafe_b64encode(output.encode()).decode()
+    parts = [name[k : k + PART] for k in range(0, len(name), PART)]
+    return "/".join([*(f"@{part}" for part in parts[:-1]), parts[-1]])

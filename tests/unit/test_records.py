@@ -1,0 +1,23 @@
+"""Which outputs Snakemake has a record of."""
+
+from base64 import urlsafe_b64encode
+from pathlib import Path
+
+from snakesfm.records import unrecorded_files
+
+
+def test_files_with_a_record_are_known_however_long_their_names(tmp_path: Path) -> None:
+    short, long = tmp_path / "a.h5", tmp_path / ("deep" * 50) / ("name" * 40 + ".h5")
+    for path in (short, long, tmp_path / "b.h5", tmp_path / "c.json"):
+        path.parent.mkdir(exist_ok=True)
+        path.touch()
+    records = tmp_path / "records"
+    for path in (short, long):
+        code = urlsafe_b64encode(str(path).encode()).decode()
+        parts = [code[k : k + 254] for k in range(0, len(code), 254)]
+        record = records.joinpath(*[f"@{part}" for part in parts[:-1]], parts[-1])
+        record.parent.mkdir(parents=True, exist_ok=True)
+        record.touch()
+    assert len(parts) == 3
+    outputs = [str(tmp_path / name) for name in ("a.h5", "b.h5", "c.json", "missing.h5")]
+    assert unrecorded_files([*outputs, str(long)], records) == [tmp_path / "b.h5"]
