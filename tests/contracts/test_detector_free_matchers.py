@@ -113,9 +113,10 @@ class TestVirtualPlaces(DetectorFreeContract):
     method = "virtual_places"
     spread_px, noise_px = 2.0, 0.3
 
-    @pytest.fixture
-    def model(self, tmp_path):
-        folder = tmp_path / "square"
+    @pytest.fixture(scope="class")
+    @classmethod
+    def model(cls, tmp_path_factory):
+        folder = tmp_path_factory.mktemp("virtual") / "square"
         make_demo(folder, DemoOptions(image_count=16, width=100, height=75))
         return read_model(folder / "reference")
 
