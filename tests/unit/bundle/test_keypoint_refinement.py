@@ -156,12 +156,13 @@ def test_an_image_in_which_nothing_can_be_aligned_keeps_its_keypoints(scene):
 
 def test_threads_do_not_change_the_result(scene):
     moved = []
-    for threads in (1, 3):
+    for threads in (1, 2, 8):
         reconstruction = model_of(scene, 0.2)
         settings = AlignmentSettings(threads=threads)
         assert refine_keypoints(reconstruction, read(scene[1]), np.ones(5), settings) == (750, 750)
         moved.append([reconstruction.image(i).point2D(k).xy for i in range(1, 6) for k in range(150)])
-    np.testing.assert_array_equal(*moved)
+    for others in moved[1:]:
+        np.testing.assert_array_equal(moved[0], others)
 
 
 def test_patches_outside_do_not_move(scene):
