@@ -19,7 +19,7 @@ from snakesfm.calibration.condensed import (
     fit_essential,
     reduced_equations,
 )
-from snakesfm.calibration.epipolar import EpipolarPair
+from snakesfm.calibration.epipolar import EpipolarPair, cameras_of
 from snakesfm.two_view.estimators import poselib_camera
 from snakesfm.two_view.sampson import (
     Correspondences,
@@ -54,13 +54,11 @@ class FocalAdjustment:
     focals : (C,) pixels.
     sigmas : (C,) relative standard deviations, of the prior and all agreeing pairs; 0 where held.
     agreeing : (C,) int, pairs that agree with the result and constrain it.
-    disagreement : median over pairs of how far each is from its own best focal lengths, in its own sigmas.
     """
 
     focals: Array
     sigmas: Array
     agreeing: Array
-    disagreement: float
 
 
 def adjust_focals(
@@ -93,8 +91,15 @@ def adjust_focals(
         h = np.array([h for _, h, _ in found]).reshape(-1, 2, 2)
         return h, np.array([b for _, _, b in found]).reshape(-1, 2)
 
-    cameras = np.array([(pair.camera_i, pair.camera_j) for pair in pairs], dtype=np.int64).reshape(-1, 2)
-    return _solve(cameras, linearise, focals, free, prior, prior_sigma, FINAL_ITERATIONS)
+    cameras, held = cameras_of(pairs), ~np.asarray(free, dtype=bool)
+    found = _solve(cameras, linearise, focals, held, prior, prior_sigma, FINAL_ITERATIONS)
+    strengths = np.sqrt(np.max(np.diagonal(found.h, axis1=1, axis2=2), axis=1))
+    agrees = (found.distances < 2.0 * AGREEMENT) & (strengths > MIN_STRENGTH)
+    first, second = cameras[agrees].T
+    agreeing = np.bincount(first, minlength=len(focals))
+    agreeing += np.bincount(second[first != second], minlength=len(focals))
+    sigmas = np.sqrt(np.diag(np.linalg.inv(found.information.toarray()))) * ~held
+    return FocalAdjustment(np.exp(found.logs), sigmas, agreeing.astype(np.int32))
 
 
 def adjust_condensed(
@@ -109,46 +114,52 @@ def adjust_condensed(
         fit = fit_essential(pairs, units[:, None], fit, 2 if fit is None else 1)
         return reduced_equations(units, fit)
 
-    return _solve(pairs.cameras, linearise, focals, free, prior, prior_sigma, ITERATIONS).focals
+    held = ~np.asarray(free, dtype=bool)
+    found = _solve(pairs.cameras, linearise, focals, held, prior, prior_sigma, ITERATIONS)
+    return np.asarray(np.exp(found.logs))
+
+
+@dataclass(frozen=True)
+class _Solution:
+    """Log focal lengths (C,), and the equations of their last step: all, and each pair's ``h`` (P,2,2).
+
+    ``distances`` (P,) are the lengths of the pairs' own steps in sigmas.
+    """
+
+    logs: Array
+    information: Any
+    h: Array
+    distances: Array
 
 
 def _solve(
     cameras: Array,
     linearise: Callable[[Array], tuple[Array, Array]],
     focals: Array,
-    free: Array,
+    held: Array,
     prior: Array,
     prior_sigma: Array,
     iterations: int,
-) -> FocalAdjustment:
+) -> _Solution:
     """Iterate on the equations (P,2,2), (P,2) of ``cameras`` (P,2) that ``linearise`` gives."""
     count = len(focals)
     logs, prior_logs = np.log(np.asarray(focals, dtype=np.float64)), np.log(prior)
-    held = ~np.asarray(free, dtype=bool)
     rows, columns = np.repeat(cameras, 2, axis=1).ravel(), np.tile(cameras, 2).ravel()
+    trust = prior_sigma**-2.0
+    own = diags_array(np.where(held, 1.0, trust), format="csc")
     for _ in range(iterations):
         h, b, distances = _capped(*_in_cameras(*linearise(np.exp(logs)), cameras, held))
         weights = 1.0 / (1.0 + (distances / AGREEMENT) ** 2)
         values = (weights[:, None, None] * h).ravel()
-        diagonal = np.where(held, 1.0, prior_sigma**-2.0)
-        H = coo_array((values, (rows, columns)), shape=(count, count)).tocsc() + diags_array(
-            diagonal, format="csc"
-        )
-        g = (logs - prior_logs) * prior_sigma**-2.0
+        H = coo_array((values, (rows, columns)), shape=(count, count)).tocsc() + own
+        g = (logs - prior_logs) * trust
         g += np.bincount(cameras.ravel(), (weights[:, None] * b).ravel(), minlength=count)
         g[held] = 0.0
         step = np.clip(-splu(H).solve(g), -MAX_LOG_STEP, MAX_LOG_STEP)
         logs = logs + step
         if np.max(np.abs(step), initial=0.0) < SMALL_LOG_STEP:
             break
-    strengths = np.sqrt(np.max(np.diagonal(h, axis1=1, axis2=2), axis=1))
-    agrees = (distances < 2.0 * AGREEMENT) & (strengths > MIN_STRENGTH)
-    first, second = cameras[agrees].T
-    agreeing = np.bincount(first, minlength=count)
-    agreeing += np.bincount(second[first != second], minlength=count)
-    sigmas = np.sqrt(np.diag(np.linalg.inv(H.toarray()))) * ~held
-    disagreement = float(np.median(distances)) if len(cameras) else 0.0
-    return FocalAdjustment(np.exp(logs), sigmas, agreeing.astype(np.int32), disagreement)
+    return _Solution(logs, H, h, distances)
 
 
 def _in_cameras(h: Array, b: Array, cameras: Array, held: Array) -> tuple[Array, Array]:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from snakesfm.calibration.epipolar import EpipolarPair
+from snakesfm.calibration.epipolar import EpipolarPair, cameras_of
 from snakesfm.geometry.rotations import GENERATORS, exp_so3
 
 Array = NDArray[Any]
@@ -84,7 +84,7 @@ class CondensedPairs:
 
 def condense_pairs(pairs: Sequence[EpipolarPair]) -> CondensedPairs:
     """Pairs in the form that :class:`CondensedPairs` works on."""
-    cameras = np.array([(pair.camera_i, pair.camera_j) for pair in pairs], dtype=np.int64).reshape(-1, 2)
+    cameras = cameras_of(pairs)
     scales, F, products = np.ones(len(pairs)), np.zeros((len(pairs), 3, 3)), []
     for row, pair in enumerate(pairs):
         some = slice(None, None, -(-len(pair.points_i) // MAX_POINTS))
@@ -134,10 +134,10 @@ def fit_essential(
         left, right = _nearest_essential(np.repeat(pairs.F, shape[1], axis=0), units)
     else:
         left, right = start.left, start.right
-    forms, costs = pairs.condense(_matrices(left, right, units).reshape(*shape, 9))
+    forms, costs = pairs.condense(_matrices(left, right, units)[0].reshape(*shape, 9))
     for _ in range(rounds):
         tried = _descend(left, right, forms.reshape(-1, 9, 9), units)
-        tried_forms, tried_costs = pairs.condense(_matrices(*tried, units).reshape(*shape, 9))
+        tried_forms, tried_costs = pairs.condense(_matrices(*tried, units)[0].reshape(*shape, 9))
         better = tried_costs < costs
         costs = np.where(better, tried_costs, costs)
         forms = np.where(better[..., None, None], tried_forms, forms)
@@ -174,12 +174,13 @@ def reduced_equations(units: Array, fit: EssentialFit) -> tuple[Array, Array]:
     """Normal equations (N,2,2), (N,2) of the two log focal lengths, the essential matrix eliminated."""
     forms = fit.forms
     _, values, by_pose = _derivatives(fit.left, fit.right, forms, units)
+    _, lengths = _matrices(fit.left, fit.right, units)
     matrix = fit.left @ PROJECTION @ fit.right.transpose(0, 2, 1)
     by_focal = -np.stack([matrix, matrix], axis=1)
     # the focal length of the first image divides the first two columns, that of the second the rows
     by_focal[:, 0, :, 2] = 0.0
     by_focal[:, 1, 2, :] = 0.0
-    jacobian = np.concatenate([by_pose, _normalised(by_focal, matrix, units)], axis=2)
+    jacobian = np.concatenate([by_pose, _normalised(by_focal, values, lengths, units)], axis=2)
     H, g = _normal_equations(jacobian, forms, values)
     A, B = H[:, :5, :5], H[:, :5, 5:]
     A = A + 1e-9 * np.trace(A, axis1=1, axis2=2)[:, None, None] * np.eye(5)
@@ -189,9 +190,7 @@ def reduced_equations(units: Array, fit: EssentialFit) -> tuple[Array, Array]:
 
 
 def _nearest_essential(F: Array, units: Array) -> tuple[Array, Array]:
-    rows = np.stack([units[:, 1], units[:, 1], np.ones(len(F))], axis=1)
-    columns = np.stack([units[:, 0], units[:, 0], np.ones(len(F))], axis=1)
-    left, _, right = np.linalg.svd(F * rows[:, :, None] * columns[:, None, :])
+    left, _, right = np.linalg.svd(_scaled(F, units))
     right = right.transpose(0, 2, 1)
     # the third singular value is 0, so its vectors may change their sign
     for turned in (left, right):
@@ -201,10 +200,9 @@ def _nearest_essential(F: Array, units: Array) -> tuple[Array, Array]:
 
 def _derivatives(left: Array, right: Array, forms: Array, units: Array) -> tuple[Array, Array, Array]:
     """Costs (N,), the fundamental matrices of unit norm (N,9) and their derivatives by the pose (N,9,5)."""
-    transposed = right.transpose(0, 2, 1)
-    matrix = left @ PROJECTION @ transposed
-    jacobian = _normalised(left[:, None] @ TURNS @ transposed[:, None], matrix, units)
-    values = _matrices(left, right, units)
+    values, lengths = _matrices(left, right, units)
+    moved = left[:, None] @ TURNS @ right.transpose(0, 2, 1)[:, None]
+    jacobian = _normalised(moved, values, lengths, units)
     costs = np.einsum("nk,nk->n", values, (forms @ values[..., None])[..., 0])
     return costs, values, jacobian
 
@@ -214,26 +212,28 @@ def _normal_equations(jacobian: Array, forms: Array, values: Array) -> tuple[Arr
     return weighted @ jacobian, (weighted @ values[..., None])[..., 0]
 
 
-def _normalised(derivatives: Array, matrix: Array, units: Array) -> Array:
+def _normalised(derivatives: Array, values: Array, lengths: Array, units: Array) -> Array:
     """Derivatives (N,9,K) of the scaled matrix made unit, from those of the essential matrix (N,K,3,3)."""
-    scaled = _scaled(matrix, units).reshape(-1, 9)
-    lengths = np.linalg.norm(scaled, axis=1)
-    values = scaled / lengths[:, None]
-    moved = _scaled(derivatives, units[:, None]).reshape(*derivatives.shape[:2], 9) / lengths[:, None, None]
+    scaled = _scaled(derivatives, 1.0 / units[:, None]).reshape(*derivatives.shape[:2], 9)
+    moved = scaled / lengths[:, None, None]
     along = np.einsum("npk,nk->np", moved, values)
     result: Array = (moved - along[..., None] * values[:, None]).transpose(0, 2, 1)
     return result
 
 
-def _matrices(left: Array, right: Array, units: Array) -> Array:
-    """Fundamental matrices (N,9) of unit norm."""
-    scaled = _scaled(left @ PROJECTION @ right.transpose(0, 2, 1), units).reshape(-1, 9)
-    return np.asarray(scaled / np.linalg.norm(scaled, axis=1, keepdims=True))
+def _matrices(left: Array, right: Array, units: Array) -> tuple[Array, Array]:
+    """Fundamental matrices (N,9) of unit norm, and the norms (N,) that they had."""
+    scaled = _scaled(left @ PROJECTION @ right.transpose(0, 2, 1), 1.0 / units).reshape(-1, 9)
+    lengths = np.linalg.norm(scaled, axis=1)
+    return scaled / lengths[:, None], lengths
 
 
-def _scaled(matrices: Array, units: Array) -> Array:
-    """Essential matrices (...,3,3) to fundamental ones in units of the pair's scale."""
-    one = np.ones(units.shape[:-1])
-    columns = np.stack([1.0 / units[..., 0], 1.0 / units[..., 0], one], axis=-1)
-    rows = np.stack([1.0 / units[..., 1], 1.0 / units[..., 1], one], axis=-1)
+def _scaled(matrices: Array, factors: Array) -> Array:
+    """Matrices (...,3,3) with their first two columns and rows times the first and second of the factors.
+
+    Focal lengths make a fundamental matrix an essential one, and their inverses the other way round.
+    """
+    one = np.ones(factors.shape[:-1])
+    columns = np.stack([factors[..., 0], factors[..., 0], one], axis=-1)
+    rows = np.stack([factors[..., 1], factors[..., 1], one], axis=-1)
     return np.asarray(matrices * rows[..., :, None] * columns[..., None, :])

@@ -1,5 +1,6 @@
 """Epipolar geometry of uncalibrated pairs, and which of them can tell a focal length."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -81,6 +82,11 @@ def estimate_epipolar_pair(
         points_i, points_j = points_i[rows], points_j[rows]
     noise_px = robust_sigma_px(_sampson_errors(F, points_i, points_j), 0.0)
     return EpipolarPair(camera_i, camera_j, points_i, points_j, F / np.linalg.norm(F), noise_px)
+
+
+def cameras_of(pairs: Sequence[EpipolarPair]) -> Array:
+    """The rows of the two cameras of each pair (P,2)."""
+    return np.array([(pair.camera_i, pair.camera_j) for pair in pairs], dtype=np.int64).reshape(-1, 2)
 
 
 def rows_of_cameras(cameras: Array, count: int) -> list[Array]:

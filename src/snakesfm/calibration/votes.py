@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from snakesfm.calibration.epipolar import EpipolarPair, rows_of_cameras
+from snakesfm.calibration.epipolar import EpipolarPair, cameras_of, rows_of_cameras
 
 Array = NDArray[Any]
 GRID_SIZE = 60
@@ -49,7 +49,7 @@ def vote_focals(
     Source of the criterion: Mendonca and Cipolla, A simple technique for self-calibration, CVPR 1999.
     """
     focals = np.array(focals, dtype=np.float64)
-    ends = np.array([(pair.camera_i, pair.camera_j) for pair in pairs], dtype=np.int64).reshape(-1, 2)
+    ends = cameras_of(pairs)
     F = np.array([pair.F for pair in pairs]).reshape(-1, 3, 3)
     rows = {camera: rows for camera, rows in enumerate(rows_of_cameras(ends, len(focals))) if free[camera]}
     for _ in range(SWEEPS):
