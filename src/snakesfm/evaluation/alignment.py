@@ -65,7 +65,8 @@ def _median_scale_translation(points: Array, reference: Array) -> tuple[float, A
     return scale, np.median(reference - scale * points, axis=0)
 
 
-def _robust_sigma(errors: Array, floor: float) -> float:
+def robust_sigma(errors: Array, floor: float) -> float:
+    """Standard deviation of lengths of errors (n,) by their median, and no less than ``floor``."""
     return max(1.4826 * float(np.median(errors)), floor)
 
 
@@ -93,8 +94,8 @@ def align_poses(
         former = estimate
         position_errors = np.linalg.norm(reference_centers - estimate.transform_points(centers), axis=1)
         rotation_errors = np.linalg.norm(differences - estimate.rotation, axis=(1, 2)) / np.sqrt(2.0)
-        sigma_position = _robust_sigma(position_errors, 1e-9 * extent)
-        sigma_rotation = _robust_sigma(rotation_errors, 1e-9)
+        sigma_position = robust_sigma(position_errors, 1e-9 * extent)
+        sigma_rotation = robust_sigma(rotation_errors, 1e-9)
         squared = (position_errors / sigma_position) ** 2 + (rotation_errors / sigma_rotation) ** 2
         weights = 1.0 / (1.0 + squared / 4.0)
         estimate = _weighted_step(

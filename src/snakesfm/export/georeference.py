@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from snakesfm.evaluation.alignment import Similarity
+from snakesfm.evaluation.alignment import Similarity, robust_sigma
 from snakesfm.geometry.colmap_binding import pycolmap
 from snakesfm.geometry.earth import Origin, local_metres
 
@@ -16,7 +16,6 @@ Array = NDArray[Any]
 COARSE_ERROR_M = 20.0
 # of a robust standard deviation: what counts as an inlier once the noise is measured
 INLIER_SIGMAS = 3.0
-MAD_TO_SIGMA = 1.4826
 LEAST_IMAGES = 4
 LEAST_INLIERS = 0.5
 # positions must spread so many times farther than they err, in two directions, to tell the similarity
@@ -91,7 +90,7 @@ def georeference(centers: Array, gps: Array, origin: Origin, seed: int) -> Geore
         )
         residuals = np.linalg.norm(found.transform_points(sources) - places, axis=1)
         inliers = residuals <= max_error
-        max_error = max(INLIER_SIGMAS * MAD_TO_SIGMA * float(np.median(residuals)), 1e-6)
+        max_error = max(INLIER_SIGMAS * robust_sigma(residuals, 0.0), 1e-6)
     if found is None:
         return None
     spread = np.linalg.svd(places - places.mean(axis=0), compute_uv=False) / np.sqrt(len(places))
