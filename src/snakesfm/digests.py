@@ -2,12 +2,26 @@
 
 import functools
 import hashlib
+import json
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
+
+# where things are, and what only the controller reads
+UNTOLD = frozenset(
+    ("images", "cameras", "pairs_file", "reference", "imported", "weights", "fetch", "weights_content")
+)
 
 
 def options_digest(stage_version: int, options: str) -> str:
     """A digest of a stage's version and the canonical JSON of its options: 16 hexadecimal digits."""
     return hashlib.sha256(f"{stage_version}\0{options}".encode()).hexdigest()[:16]
+
+
+def settings_text(settings: Mapping[str, Any], seed: int) -> str:
+    """Canonical JSON of a job's seed and settings, but for where things are: the same in any folder."""
+    told = {name: value for name, value in settings.items() if name not in UNTOLD}
+    return json.dumps(told | {"seed": seed}, sort_keys=True)
 
 
 @functools.cache

@@ -174,8 +174,8 @@ def render_artifacts_page() -> str:
         "",
         "Every stage writes HDF5 files at `OUTPUT/SCENE/STAGE/FILE.h5`, one job one file, complete or not at all. "
         "The root attributes are `artifact` (the kind below), `format_version`, `stage`, `stage_version`, `scene`, "
-        "`options` (canonical JSON) and `software`; there are no timestamps, so equal runs give equal bytes. "
-        "Readers refuse another kind or version.",
+        "`options` and `settings` (canonical JSON; the latter are the seed and what is no option) and `software`; "
+        "there are no timestamps, so equal runs give equal bytes. Readers refuse another kind or version.",
         "",
         "Letters in shapes are lengths: the same letter is the same length within one file, and `P+1` is one more "
         "than `P`. Flat tables of things that belong to others (matches of a pair, keypoints of an image) come with "

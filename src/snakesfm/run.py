@@ -31,7 +31,7 @@ class Run:
         self.slurm_run = ""
 
     def refuse_unrecorded(self) -> None:
-        """Set aside what other options or another version made and Snakemake knows nothing of.
+        """Set aside what other images, options, another seed or version made and Snakemake knows nothing of.
 
         Before the jobs are planned, so that they are planned to be made again. While another run writes to
         the folder nothing is touched: this one will be refused.
@@ -45,7 +45,7 @@ class Run:
             # loaded here, as most runs know their files and h5py takes a tenth of a second
             from snakesfm.artifacts.checks import ASIDE, set_aside
 
-            found = set_aside(unknown, scene.name, scene.options_digests)
+            found = set_aside(unknown, scene.name, scene.options_digests, scene.settings_text)
             if found:
                 print(
                     f"snakesfm: scene '{scene.name}': {len(found)} files of which this folder's .snakemake "

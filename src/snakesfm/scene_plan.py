@@ -14,7 +14,7 @@ from snakesfm.blocks import choose_blocks, tile_names
 from snakesfm.config.base import StageOptions
 from snakesfm.config.configuration import STAGES, SceneInputs
 from snakesfm.config.select_pairs import SelectPairsOptions
-from snakesfm.digests import file_digest, file_state, options_digest
+from snakesfm.digests import file_digest, file_state, options_digest, settings_text
 from snakesfm.errors import ConfigError
 from snakesfm.front_ends import (
     DETECTOR_FREE,
@@ -362,6 +362,11 @@ class ScenePlan:
             "seed": self.configuration.seed,
         }
         return json.dumps(content, sort_keys=True)
+
+    def settings_text(self, stage: str, path: Path) -> str:
+        """What a stage's file says of its seed and settings if it was made as this plan has it."""
+        parts = {"block": path.stem, "tile": path.stem}
+        return settings_text(self.settings(stage, parts, True), self.configuration.seed)
 
     def upstream(self, inputs: Iterable[str]) -> dict[str, str]:
         """The options digest of every stage that made one of these files; a job checks them against it."""

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from snakesfm.artifacts import Header, ImagePairs
-from snakesfm.artifacts.checks import check_inputs
+from snakesfm.artifacts.checks import check_inputs, set_aside
 from snakesfm.digests import options_digest
 from snakesfm.errors import ArtifactError
 
@@ -16,12 +16,17 @@ DIGESTS = {"select_pairs": options_digest(3, '{"a": 1}')}
 
 
 def write_pairs(
-    path: Path, stage: str = "select_pairs", version: int = 3, scene: str = "s", options: str = '{"a": 1}'
+    path: Path,
+    stage: str = "select_pairs",
+    version: int = 3,
+    scene: str = "s",
+    options: str = '{"a": 1}',
+    settings: str = "",
 ) -> Path:
     pairs = ImagePairs(
         pairs=np.array([[0, 1]]), reasons=np.array(["listed"], object), similarities=np.array([0.5])
     )
-    pairs.write(path, Header(stage, version, scene, options))
+    pairs.write(path, Header(stage, version, scene, options, settings))
     return path
 
 
@@ -69,3 +74,16 @@ def test_one_sentence_for_several_files(tmp_path: Path) -> None:
         check_inputs([first, second], "s", DIGESTS)
     assert not first.exists()
     assert not second.exists()
+
+
+@pytest.mark.parametrize(
+    ("made", "wanted", "kept"), [("a", "a", True), ("a", "b", False), ("", "b", True), ("a", "", True)]
+)
+def test_files_of_other_settings_are_set_aside_unless_they_are_not_told(
+    tmp_path: Path, made: str, wanted: str, kept: bool
+) -> None:
+    path = write_pairs(tmp_path / "0-0.h5", settings=made)
+    refused = set_aside([path], "s", DIGESTS, lambda stage, file: wanted if file == path else "")
+    assert path.is_file() == kept
+    assert len(refused) == 1 - kept
+    assert kept or "another seed" in refused[0]

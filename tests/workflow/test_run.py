@@ -135,6 +135,26 @@ def test_a_folder_without_records_is_taken_over_unless_its_options_differ(
     assert again.status == 0 and again.rules == [], again.text
 
 
+@pytest.mark.parametrize(("change", "refused"), [("an image", 1), ("the seed", 20)])
+def test_a_folder_without_records_is_held_against_its_images_and_seed(
+    finished, small_scene: Path, workflow, change: str, refused: int
+) -> None:
+    copy_run(finished[0], workflow.folder)
+    shutil.rmtree(workflow.folder / ".snakemake")
+    scene = workflow.folder / "square"
+    shutil.copytree(small_scene, scene)
+    config = config_of(scene)
+    if change == "an image":
+        images = sorted((scene / "images").iterdir())
+        shutil.copy(images[3], images[4])
+    else:
+        config.append("seed=1")
+    outcome = workflow.run("--until", "index_images", *config)
+    assert outcome.status == 0, outcome.text
+    assert outcome.rules.count("index_images") == 1
+    assert len(list((workflow.folder / "out").rglob("*.refused"))) == refused
+
+
 def test_an_added_image_is_indexed(finished, small_scene: Path, workflow) -> None:
     copy_run(finished[0], workflow.folder)
     scene = workflow.folder / "square"

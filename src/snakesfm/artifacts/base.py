@@ -33,6 +33,7 @@ class Header:
     stage_version: int
     scene: str
     options: str = "{}"
+    settings: str = ""
 
 
 def column(shape: str, dtype: str, description: str) -> Any:
@@ -109,6 +110,7 @@ class Artifact:
             file.attrs["stage_version"] = header.stage_version
             file.attrs["scene"] = header.scene
             file.attrs["options"] = header.options
+            file.attrs["settings"] = header.settings
             file.attrs["software"] = f"snakesfm {snakesfm.__version__}"
             for field in dataclasses.fields(self):
                 value = getattr(self, field.name)

@@ -1,6 +1,6 @@
 """Are the files that a job is about to read what the configuration says they are?"""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 
 from snakesfm.artifacts.base import read_header
@@ -34,10 +34,19 @@ def check_inputs(paths: Iterable[Path], scene: str, digests: Mapping[str, str]) 
         )
 
 
-def set_aside(paths: Iterable[Path], scene: str, digests: Mapping[str, str]) -> list[str]:
+def set_aside(
+    paths: Iterable[Path],
+    scene: str,
+    digests: Mapping[str, str],
+    settings: Callable[[str, Path], str] = lambda stage, path: "",
+) -> list[str]:
     """Rename every artifact that is damaged or not of this scene and configuration to ``*.refused``.
 
-    Parameters as in :func:`check_inputs`.
+    Parameters
+    ----------
+    paths, scene, digests : as in :func:`check_inputs`.
+    settings : what a file of a stage should say of its seed and settings; empty if it may say anything. A
+        simulated one says nothing.
 
     Returns
     -------
@@ -45,14 +54,16 @@ def set_aside(paths: Iterable[Path], scene: str, digests: Mapping[str, str]) -> 
     """
     refused = []
     for path in paths:
-        reason = _reason(path, scene, digests) if path.suffix == ".h5" and path.is_file() else ""
+        reason = _reason(path, scene, digests, settings) if path.suffix == ".h5" and path.is_file() else ""
         if reason:
             path.replace(path.with_name(path.name + ASIDE))
             refused.append(f"{path} {reason}")
     return refused
 
 
-def _reason(path: Path, scene: str, digests: Mapping[str, str]) -> str:
+def _reason(
+    path: Path, scene: str, digests: Mapping[str, str], settings: Callable[[str, Path], str]
+) -> str:
     """Why a file cannot be used; empty where it can be."""
     header = read_header(path)
     if not header:
@@ -64,4 +75,7 @@ def _reason(path: Path, scene: str, digests: Mapping[str, str]) -> str:
         return f"is of scene '{header.get('scene')}'"
     if options_digest(header.get("stage_version", 0), str(header.get("options"))) != digests[stage]:
         return f"is of another version or other options of {stage}"
+    made, wanted = header.get("settings", ""), settings(stage, path)
+    if made and wanted and made != wanted:
+        return f"is of other images, other inputs of {stage} or another seed"
     return ""

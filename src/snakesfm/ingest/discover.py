@@ -8,7 +8,7 @@ import json
 import os
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import islice
 from pathlib import Path
 
@@ -58,7 +58,11 @@ def fingerprint_images(folder: Path | str, cache_file: Path | str | None = None)
     ------
     ConfigError : the folder, or one inside it, cannot be listed.
     """
-    digests = digest_images(folder, list_images(folder), cache_file)
+    return fingerprint(digest_images(folder, list_images(folder), cache_file))
+
+
+def fingerprint(digests: Mapping[str, str]) -> str:
+    """Digest of the names of files and of their digests, in this order."""
     whole = hashlib.sha256()
     for name, digest in digests.items():
         whole.update(os.fsencode(name) + b"\0" + digest.encode() + b"\n")

@@ -3,16 +3,18 @@
 from collections import Counter
 from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from snakesfm.artifacts.images import ImageIndex
+from snakesfm.digests import settings_text
 from snakesfm.errors import ImageError, SceneError
 from snakesfm.geometry.camera import cameras_to_columns
 from snakesfm.ingest.cameras import ImageCameras, Photograph, assign_cameras
-from snakesfm.ingest.discover import digest_images, list_images
+from snakesfm.ingest.discover import digest_images, fingerprint, list_images
 from snakesfm.ingest.known import match_known_cameras, read_known_cameras
 from snakesfm.ingest.read import read_header
 from snakesfm.seeding import block_of
@@ -53,7 +55,10 @@ def run(job: StageJob) -> None:
         use_exif=options.use_exif_focal,
     )
     index = _to_index(photographs, [digests[p.name] for p in photographs], found, refused, job)
-    index.write(job.output, job.header)
+    content = {"content": fingerprint(digests)}
+    index.write(
+        job.output, replace(job.header, settings=settings_text({**job.settings, **content}, job.seed))
+    )
     _report(index)
 
 

@@ -10,6 +10,7 @@ from typing import Any, Literal, TextIO
 
 from snakesfm.artifacts.base import Header
 from snakesfm.cache import cached_path
+from snakesfm.digests import settings_text
 from snakesfm.seeding import derive_seed
 
 
@@ -85,7 +86,13 @@ class StageJob:
     @property
     def header(self) -> Header:
         """The root attributes of the artifact that this job writes."""
-        return Header(self.stage, self.options.stage_version, self.scene, self.options.canonical_json())
+        return Header(
+            self.stage,
+            self.options.stage_version,
+            self.scene,
+            self.options.canonical_json(),
+            settings_text(self.settings, self.seed),
+        )
 
     def path(self, name: str) -> Path:
         """The one file of a named input."""
