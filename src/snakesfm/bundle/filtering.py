@@ -71,29 +71,33 @@ def reset_wild_cameras(
     max_focal_change: float,
     max_guessed_focal_change: float,
     max_distortion: float,
-) -> list[int]:
-    """Give cameras whose intrinsics left what is plausible their first ones back; the rows of these.
+) -> frozenset[int]:
+    """Give cameras whose intrinsics left what is plausible their first ones back; the ids of these.
 
     Parameters
     ----------
     reconstruction : changed in place.
     cameras : the intrinsics before any adjustment.
-    max_focal_change : factor up or down.
-    max_guessed_focal_change : the same where nothing was known of the focal length.
+    max_focal_change : factor up or down, of a focal length that was given or in EXIF.
+    max_guessed_focal_change : factor of a usual focal length for all others; what matches tell of a long lens
+        is several times too short.
     max_distortion : largest absolute value of a distortion parameter of a view as wide as the default one.
     """
-    wild = []
+    wild = set()
     for row, start in enumerate(cameras):
         camera = reconstruction.camera(row + 1)
         focal = camera.mean_focal_length()
-        change = focal / start.focal_px
-        most = max_guessed_focal_change if start.source == "default" else max_focal_change
+        usual = USUAL_FOCAL_RATIO * max(start.width, start.height)
+        if start.source in ("given", "exif"):
+            change, most = focal / start.focal_px, max_focal_change
+        else:
+            change, most = focal / usual, max_guessed_focal_change
         # distortion counts in squared tangents, which are small in a narrow view
-        narrow = max(1.0, focal / (USUAL_FOCAL_RATIO * max(start.width, start.height))) ** 2
+        narrow = max(1.0, focal / usual) ** 2
         extra = camera.extra_params_idxs()
         distortion = max((abs(camera.params[k]) for k in extra), default=0.0)
         allowed = max([max_distortion * narrow, *(abs(start.params[k]) for k in extra)])
         if not 1 / most <= change <= most or distortion > allowed:
             camera.params = list(start.params)
-            wild.append(row)
-    return wild
+            wild.add(row + 1)
+    return frozenset(wild)

@@ -27,6 +27,8 @@ from snakesfm.geometry.camera import Camera
 Array = NDArray[Any]
 
 EARLY_TOLERANCE = 300.0
+# early rounds come before all observations are there, final ones after, the last of which is exact
+Phase = Literal["early", "final", "last"]
 
 # of exact keypoints the model shows no noise but that of float32 and of the solver
 EXACT_PX = 0.05
@@ -140,13 +142,13 @@ def adjust_rounds(
             source.report(
                 *refine_keypoints(reconstruction, source.read_gray, source.scales, source.settings)
             )
-        mapper.round(f"round {row + 1}", threshold, final=row == last)
+        mapper.round(f"round {row + 1}", threshold, "final" if row == last else "early")
     while settings.register_images and mapper.register():
-        mapper.round("registration", settings.thresholds_px[-1], final=True)
+        mapper.round("registration", settings.thresholds_px[-1], "final")
     if settings.refine_principal_points and settings.solver == "ceres":
         mapper.refine_principal_points()
     mapper.drop_outliers()
-    mapper.round("last pass", settings.thresholds_px[-1], final=True, last=True)
+    mapper.round("last pass", settings.thresholds_px[-1], "last")
     return mapper.records
 
 
@@ -174,12 +176,7 @@ class _Mapper:
         self.held_graph: pycolmap.CorrespondenceGraph | None = None
 
     def round(
-        self,
-        name: str,
-        threshold_px: float,
-        constant_rotations: bool = False,
-        final: bool = False,
-        last: bool = False,
+        self, name: str, threshold_px: float, phase: Phase = "early", constant_rotations: bool = False
     ) -> None:
         """One pass of the solver and the filters after it; all but the last are coarse.
 
@@ -188,14 +185,14 @@ class _Mapper:
         """
         settings = self.settings
         solving = replace(self.solving, constant_rotations=constant_rotations)
-        if not last:
+        if phase != "last":
             solving = replace(solving, function_tolerance=solving.function_tolerance * EARLY_TOLERANCE)
-        if final:
+        if phase != "early":
             # the solver takes most memory here, and few models need their matches again
             self.held_graph = None
             solving = replace(
                 solving,
-                loss=settings.last_loss if last else solving.loss,
+                loss=settings.last_loss if phase == "last" else solving.loss,
                 loss_scale_px=self.loss_scale_px(),
             )
         else:
@@ -208,7 +205,7 @@ class _Mapper:
                 and len(self.records) + 1 >= settings.distortion_from_round,
             )
         drop_short_tracks(self.reconstruction, settings.min_track_length)
-        costs = self.solve(solving, final)
+        costs = self.solve(solving, phase)
         wild = reset_wild_cameras(
             self.reconstruction,
             self.cameras,
@@ -217,12 +214,12 @@ class _Mapper:
             settings.max_distortion,
         )
         if wild:
-            held = solving.constant_cameras | {row + 1 for row in wild}
-            costs = self.solve(replace(solving, constant_cameras=held), final)
+            held = solving.constant_cameras | wild
+            costs = self.solve(replace(solving, constant_cameras=held), phase)
         filter_observations(
             self.reconstruction, threshold_px, settings.min_angle_deg, settings.min_track_length
         )
-        if final:
+        if phase != "early":
             deregister_weak_images(self.reconstruction, settings.min_observations)
         self.reconstruction.update_point_3d_errors()
         record = RoundRecord(
@@ -238,10 +235,10 @@ class _Mapper:
         self.records.append(record)
         self.report(record)
 
-    def solve(self, solving: SolverSettings, final: bool) -> tuple[float, float]:
+    def solve(self, solving: SolverSettings, phase: Phase) -> tuple[float, float]:
         """One pass of the solver, in large models on as many observations as the settings say."""
         settings = self.settings
-        per_image = settings.final_observations if final else settings.early_observations
+        per_image = settings.early_observations if phase == "early" else settings.final_observations
         if not per_image or self.reconstruction.num_reg_images() <= settings.select_above_images:
             return self.adjust(self.reconstruction, solving)
         return adjust_selection(self.reconstruction, self.adjust, solving, per_image, settings.seed)
@@ -261,7 +258,7 @@ class _Mapper:
         before = self.solving
         held = frozenset(self.reconstruction.cameras) - told
         self.solving = replace(before, constant_cameras=held, refine_principal_points=True)
-        self.round("principal points", self.settings.thresholds_px[-1], final=True)
+        self.round("principal points", self.settings.thresholds_px[-1], "final")
         self.solving = before
 
     def drop_outliers(self) -> None:

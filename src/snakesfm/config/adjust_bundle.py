@@ -10,7 +10,7 @@ from snakesfm.config.base import StageOptions
 class AdjustBundleOptions(StageOptions):
     """How cameras, poses and points are adjusted together."""
 
-    stage_version: ClassVar[int] = 9
+    stage_version: ClassVar[int] = 10
 
     solver: Literal["ceres", "gtsam"] = "ceres"
     """Least-squares solver: Ceres through pycolmap, or gtsam (slower, fewer camera models)."""
@@ -61,10 +61,10 @@ class AdjustBundleOptions(StageOptions):
     """Distance from the start, over the longer side, beyond which a principal point is not believed."""
 
     max_focal_change: float = Field(default=3.0, gt=1.0)
-    """Factor by which a focal length may change before the camera is reset and held in the pass."""
+    """Factor by which a focal length of EXIF may change before the camera is reset and held in the pass."""
 
     max_guessed_focal_change: float = Field(default=15.0, gt=1.0)
-    """The same where neither EXIF nor the matches told the focal length, as for a long lens."""
+    """The same without EXIF, as a factor of 1.2 times the longer side."""
 
     max_distortion: float = Field(default=1.0, gt=0.0)
     """Largest distortion parameter before the camera is reset and held; larger in a narrow view."""

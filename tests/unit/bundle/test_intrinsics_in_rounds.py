@@ -76,7 +76,7 @@ def test_a_camera_gone_wild_is_free_again_in_the_next_pass(passes, monkeypatch):
 
 
 def test_a_camera_that_is_always_wild_keeps_its_first_intrinsics():
-    np.testing.assert_array_equal(adjusted(max_focal_change=1.001), START.params)
+    np.testing.assert_array_equal(adjusted(max_guessed_focal_change=1.001), START.params)
 
 
 def test_final_passes_iterate_within_their_steps_and_only_the_last_is_solved_to_the_end(passes):

@@ -120,13 +120,16 @@ def test_weak_images_are_taken_out():
 @pytest.mark.parametrize(
     ("params", "source", "wild"),
     [
-        ((500.0, 320.0, 240.0, 0.1), "exif", []),
-        ((1600.0, 320.0, 240.0, 0.1), "exif", [0]),
-        ((1600.0, 320.0, 240.0, 0.1), "default", []),
-        ((7600.0, 320.0, 240.0, 0.1), "default", [0]),
-        ((500.0, 320.0, 240.0, -1.5), "default", [0]),
-        ((5000.0, 320.0, 240.0, -30.0), "default", []),
-        ((5000.0, 320.0, 240.0, -50.0), "default", [0]),
+        ((500.0, 320.0, 240.0, 0.1), "exif", False),
+        ((1600.0, 320.0, 240.0, 0.1), "exif", True),
+        ((1600.0, 320.0, 240.0, 0.1), "default", False),
+        ((11000.0, 320.0, 240.0, 0.1), "estimated", False),
+        ((12000.0, 320.0, 240.0, 0.1), "estimated", True),
+        ((55.0, 320.0, 240.0, 0.1), "estimated", False),
+        ((50.0, 320.0, 240.0, 0.1), "estimated", True),
+        ((500.0, 320.0, 240.0, -1.5), "default", True),
+        ((5000.0, 320.0, 240.0, -30.0), "default", False),
+        ((5000.0, 320.0, 240.0, -50.0), "default", True),
     ],
 )
 def test_wild_cameras_are_reset(params, source, wild):
@@ -134,7 +137,7 @@ def test_wild_cameras_are_reset(params, source, wild):
     start = Camera("SIMPLE_RADIAL", 640, 480, (500.0, 320.0, 240.0, 0.0), source)
     model = replace(model_of(made), cameras=(replace(start, params=params),))
     reconstruction = to_reconstruction(model, made.keypoints, NAMES)
-    assert reset_wild_cameras(reconstruction, [start], 3.0, 15.0, 1.0) == wild
+    assert reset_wild_cameras(reconstruction, [start], 3.0, 15.0, 1.0) == ({1} if wild else set())
     if wild:
         assert tuple(reconstruction.camera(1).params) == start.params
 
