@@ -163,6 +163,11 @@ class Cluster:
         self._spawn("slurmctld", ["slurmctld", "-D", "-f", str(self.configuration)])
         wait_for(lambda: "UP" in self.call("scontrol", "ping"), "slurmctld")
 
+    def forget_jobs(self) -> None:
+        """Lose what a controller that does not run has saved of its jobs, as a crash may lose the newest."""
+        for saved in (self.folder / "state").glob("job_state*"):
+            saved.unlink()
+
     def start_node(self, name: str) -> None:
         """Start one slurmd."""
         self._spawn(name, ["slurmd", "-D", "-N", name, "-f", str(self.configuration)])

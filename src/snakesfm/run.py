@@ -31,7 +31,7 @@ class Run:
         self.slurm_run = ""
 
     def refuse_unrecorded(self) -> None:
-        """Set aside what other images, options, another seed or version made and Snakemake knows nothing of.
+        """Set aside what other images, options or seeds made and Snakemake knows nothing of.
 
         Before the jobs are planned, so that they are planned to be made again. While another run writes to
         the folder nothing is touched: this one will be refused.

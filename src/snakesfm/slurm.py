@@ -1,41 +1,93 @@
-"""The SLURM jobs of an earlier run: they live on when the run that submitted them was killed."""
+"""SLURM jobs: those of an earlier run, which live on when it was killed, and those that SLURM forgot."""
 
 import subprocess
 import sys
 import time
+from collections.abc import AsyncIterator
 from typing import Any
 
 from snakesfm.errors import ConfigError
 
 LONGEST_WAIT_S = 300
+# of answers that lack a job
+FORGOTTEN_S = 60
 
 
 def steady(executor: Any) -> None:
-    """Have Snakemake's SLURM plugin (2.8) ask for its jobs at a steady pace, and go on while SLURM is down.
+    """Have Snakemake's SLURM plugin (2.8) ask for its jobs at a steady pace, and lose none of them.
 
     By itself it lets 10 s more pass after each answer in which no job had ended, so that a job of one
-    minute is noticed half a minute late. And it asks before each query how long SLURM remembers jobs; where
+    minute is noticed half a minute late. It asks before each query how long SLURM remembers jobs; where
     slurmctld does not answer, it takes ``sacct`` for all attempts of that query, and without accounting it
-    has then lost its jobs.
+    has then lost its jobs. It loses them too after a query that failed at all attempts, and it waits for
+    ever for a job that SLURM forgot, as a slurmctld that crashed forgets the newest ones.
 
     Parameters
     ----------
     executor : the plugin's, with jobs or without; its queries are as far apart as Snakemake's option
         ``seconds-between-status-checks`` says, at most.
     """
-    kind = type(executor)
-    longest = executor.workflow.remote_execution_settings.seconds_between_status_checks
-
-    def seconds(self: Any) -> float:
-        chosen: float = kind.next_seconds_between_status_checks.fget(self)
-        return float(min(chosen, longest))
-
-    pace = property(seconds, kind.next_seconds_between_status_checks.fset)
-    executor.__class__ = type(kind.__name__, (kind,), {"next_seconds_between_status_checks": pace})
-    plugin: Any = sys.modules[kind.__module__]
-    age = plugin.get_min_job_age()
+    plugin: Any = sys.modules[type(executor).__module__]
+    executor.__class__ = _patient_kind(type(executor))
+    executor.answer, executor.missing_since = None, {}
+    age, ask = plugin.get_min_job_age(), plugin.query_job_status
     if age is not None:
         plugin.get_min_job_age = lambda: age
+
+    async def remember(command: str, logger: Any) -> Any:
+        found = await ask(command, logger)
+        executor.answer = found[0]
+        return found
+
+    plugin.query_job_status = remember
+
+
+def _patient_kind(kind: Any) -> Any:
+    """A class below the plugin's.
+
+    Of its objects ``answer`` is the last query's: states by job id, None where SLURM did not answer; and
+    ``missing_since`` says since when, on the monotonic clock, answers lack a job.
+    """
+
+    class Patient(kind):  # type: ignore[misc]
+        @property
+        def next_seconds_between_status_checks(self) -> float:
+            settings = self.workflow.remote_execution_settings
+            longest = settings.seconds_between_status_checks
+            return float(min(super().next_seconds_between_status_checks, longest))
+
+        @next_seconds_between_status_checks.setter
+        def next_seconds_between_status_checks(self, seconds: float) -> None:
+            kind.next_seconds_between_status_checks.fset(self, seconds)
+
+        async def check_active_jobs(self, active_jobs: list[Any]) -> AsyncIterator[Any]:
+            parent = super()
+            unfinished = [job async for job in parent.check_active_jobs(active_jobs)]
+            if self.answer is None:
+                unfinished = active_jobs
+            for job in unfinished:
+                if not self.is_forgotten(job.external_jobid):
+                    yield job
+                    continue
+                # Snakemake then looks for its output, and runs it again where that is missing
+                self.logger.warning(f"SLURM does not know job {job.external_jobid} any more.")
+                self.report_job_success(job)
+
+        def is_forgotten(self, number: str) -> bool:
+            """Whether SLURM has answered for some time as if there were no such job."""
+            if self.answer is None or number in self.answer:
+                self.missing_since.pop(number, None)
+                return False
+            since = self.missing_since.setdefault(number, time.monotonic())
+            if time.monotonic() - since < FORGOTTEN_S:
+                return False
+            try:
+                # accounting may lag behind
+                return number not in list_jobs(self.run_uuid)
+            except (OSError, subprocess.SubprocessError):
+                return False
+
+    return Patient
 
 
 def list_jobs(run: str) -> list[str]:

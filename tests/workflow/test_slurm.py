@@ -5,6 +5,7 @@ import os
 import re
 import shutil
 import signal
+import subprocess
 import tempfile
 import threading
 import time
@@ -61,10 +62,10 @@ def process_of(log: Path) -> tuple[int, str] | None:
     return None
 
 
-def wait_for_process(log: Path) -> tuple[int, str]:
-    wait_for(lambda: process_of(log), f"a job that writes {log}", 400)
+def wait_for_process(log: Path, run: subprocess.Popen[str] | None = None) -> tuple[int, str]:
+    wait_for(lambda: process_of(log) or (run and run.poll() is not None), f"a job that writes {log}", 400)
     found = process_of(log)
-    assert found is not None, f"{log}: the job ended too early"
+    assert found is not None, f"{log}: the job or the run ended too early"
     return found
 
 
@@ -176,7 +177,7 @@ def test_a_controller_that_is_ended_leaves_nothing_that_hinders_the_next(
         (output / "adjust_bundle" / "reconstruction.h5").unlink(missing_ok=True)
         shutil.rmtree(output / "logs" / "adjust_bundle")
         run = on_slurm.start(*arguments)
-        pid, job = wait_for_process(output / "logs" / "adjust_bundle" / "job.log")
+        pid, job = wait_for_process(output / "logs" / "adjust_bundle" / "job.log", run)
         if number == signal.SIGKILL:
             os.kill(pid, signal.SIGSTOP)
             second = on_slurm.run(*arguments)
@@ -199,21 +200,25 @@ def test_a_controller_that_is_ended_leaves_nothing_that_hinders_the_next(
     assert not list(output.rglob("*.tmp"))
 
 
+@pytest.mark.parametrize("forgets", [False, True])
 def test_a_run_goes_on_when_slurm_is_back(
-    finished, small_scene: Path, cluster: Cluster, on_slurm: Workflow
+    finished, small_scene: Path, cluster: Cluster, on_slurm: Workflow, forgets: bool
 ) -> None:
     copy_run(finished[0], on_slurm.folder)
     output = on_slurm.folder / "out" / "square"
     (output / "render_report" / "index.html").unlink()
     shutil.rmtree(output / "logs" / "render_report")
     run = on_slurm.start(*QUICK, "--slurm-status-attempts", "60", *config_of(small_scene))
-    wait_for_process(output / "logs" / "render_report" / "job.log")
+    wait_for_process(output / "logs" / "render_report" / "job.log", run)
     cluster.kill("slurmctld")
+    if forgets:
+        cluster.forget_jobs()
     time.sleep(OUTAGE_S)
     assert run.poll() is None
     cluster.start_controller()
     text, _ = run.communicate(timeout=300)
     assert run.returncode == 0, text
+    assert not forgets or re.search(r"SLURM does not know job \d+ any more", text)
     assert (output / "render_report" / "index.html").is_file()
     assert model_bytes(output) == model_bytes(finished[0])
 

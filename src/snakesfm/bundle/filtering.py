@@ -79,8 +79,8 @@ def reset_wild_cameras(
     reconstruction : changed in place.
     cameras : the intrinsics before any adjustment.
     max_focal_change : factor up or down, of a focal length that was given or in EXIF.
-    max_guessed_focal_change : factor of a usual focal length for all others; what matches tell of a long lens
-        is several times too short.
+    max_guessed_focal_change : factor of a usual focal length for all others; what matches tell of a long
+        lens is several times too short.
     max_distortion : largest absolute value of a distortion parameter of a view as wide as the default one.
     """
     wild = set()
