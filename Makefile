@@ -51,7 +51,7 @@ check: setup
 	$(BIN)/snakemake --profile profiles/local --quiet --dry-run --config images=demo/images output=results
 
 test: check deep surface cluster
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest --numprocesses 2 --dist loadfile --no-loadscope-reorder
 
 clean:
 	rm -rf .venv results demo .snakemake

@@ -17,6 +17,13 @@ PACKAGES_WITH_WEIGHTS = (LIGHTGLUE, XFEAT)
 DATA = ROOT.parent / "shared" / "data"
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Begin with what takes longest, so that two processes end together."""
+    items.sort(
+        key=lambda item: (item.path.name != "test_slurm.py", item.get_closest_marker("workflow") is None)
+    )
+
+
 @pytest.fixture(scope="session")
 def root() -> Path:
     """The project's folder."""
