@@ -61,7 +61,7 @@ def _patient_kind(kind: Any) -> Any:
             kind.next_seconds_between_status_checks.fset(self, seconds)
 
         async def check_active_jobs(self, active_jobs: list[Any]) -> AsyncIterator[Any]:
-            parent = super()
+            parent: Any = super()
             unfinished = [job async for job in parent.check_active_jobs(active_jobs)]
             if self.answer is None:
                 unfinished = active_jobs
