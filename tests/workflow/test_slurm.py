@@ -208,7 +208,7 @@ def test_a_run_goes_on_when_slurm_is_back(
     output = on_slurm.folder / "out" / "square"
     (output / "render_report" / "index.html").unlink()
     shutil.rmtree(output / "logs" / "render_report")
-    run = on_slurm.start(*QUICK, "--slurm-status-attempts", "60", *config_of(small_scene))
+    run = on_slurm.start(*QUICK, *config_of(small_scene))
     wait_for_process(output / "logs" / "render_report" / "job.log", run)
     cluster.kill("slurmctld")
     if forgets:
