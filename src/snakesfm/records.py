@@ -1,10 +1,16 @@
 """What Snakemake noted of the files that it made."""
 
+import re
 from base64 import urlsafe_b64encode
 from collections.abc import Iterable
 from pathlib import Path
 
 RECORDS = Path(".snakemake", "metadata")
+MAKES_NOTHING = re.compile(
+    r"-[a-zA-Z]*[nSDlt][a-zA-Z]*|"
+    r"--(dry-?run|touch|unlock|lint|report|archive|l[tipu]|list.*|summary|detailed-summary|dag|rulegraph|filegraph|"
+    r"d3dag|cleanup-.*|delete-.*|containerize|generate-unit-tests|export-cwl|print-compilation)(=.*)?"
+)
 # the longest name of a file, less the mark of a part that goes on
 PART = 254
 
@@ -23,6 +29,11 @@ def unrecorded_files(outputs: Iterable[str], records: Path = RECORDS) -> list[Pa
     artifacts = [output for output in outputs if output.endswith(".h5")]
     unknown = [output for output in artifacts if not (records / _record_name(output)).is_file()]
     return [path for path in map(Path, unknown) if path.is_file()]
+
+
+def makes_nothing(arguments: Iterable[str]) -> bool:
+    """Whether Snakemake is only asked for something, by these arguments of its command line."""
+    return any(MAKES_NOTHING.fullmatch(argument) for argument in arguments)
 
 
 def _record_name(output: str) -> str:

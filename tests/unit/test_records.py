@@ -3,7 +3,9 @@
 from base64 import urlsafe_b64encode
 from pathlib import Path
 
-from snakesfm.records import unrecorded_files
+import pytest
+
+from snakesfm.records import makes_nothing, unrecorded_files
 
 
 def test_files_with_a_record_are_known_however_long_their_names(tmp_path: Path) -> None:
@@ -21,3 +23,23 @@ def test_files_with_a_record_are_known_however_long_their_names(tmp_path: Path) 
     assert len(parts) == 3
     outputs = [str(tmp_path / name) for name in ("a.h5", "b.h5", "c.json", "missing.h5")]
     assert unrecorded_files([*outputs, str(long)], records) == [tmp_path / "b.h5"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "nothing"),
+    [
+        (["--profile", "profiles/local", "--config", "output=out"], False),
+        (["-c", "2", "-k", "databases", "--report-after-run"], False),
+        (["-j2", "--rerun-incomplete", "--list-untracked"], True),
+        (["-np"], True),
+        (["--dryrun", "--cores", "1"], True),
+        (["--summary"], True),
+        (["-S"], True),
+        (["--report=out.html"], True),
+        (["--lint"], True),
+        (["--rulegraph", "mermaid-js"], True),
+        (["--unlock"], True),
+    ],
+)
+def test_what_makes_nothing_is_told_by_its_arguments(arguments: list[str], nothing: bool) -> None:
+    assert makes_nothing(arguments) == nothing

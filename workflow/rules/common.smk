@@ -12,6 +12,7 @@ from snakesfm import resources, slurm
 from snakesfm.errors import SnakesfmError
 from snakesfm.blocks import tile_names
 from snakesfm.plan import Plan
+from snakesfm.records import makes_nothing
 from snakesfm.run import Run
 
 try:
@@ -21,9 +22,7 @@ try:
 except SnakesfmError as error:
     raise WorkflowError(str(error)) from None
 RUN = Run(PLAN)
-if workflow.is_main_process and not any(
-    re.fullmatch(r"--dry-?run|-[a-zA-Z]*n[a-zA-Z]*", given) for given in sys.argv[1:]
-):
+if workflow.is_main_process and not makes_nothing(sys.argv[1:]):
     RUN.refuse_unrecorded()
 
 IN_CONTAINER = (
