@@ -19,11 +19,11 @@ try:
     # Snakemake knows its targets only later, and this one needs no images
     asked = {argument.split(":")[0] for argument in sys.argv[1:]}
     PLAN = Plan(config, weights_only="fetch_weights" in asked)
+    RUN = Run(PLAN)
+    if workflow.is_main_process and not makes_nothing(sys.argv[1:]):
+        RUN.refuse_unrecorded()
 except SnakesfmError as error:
     raise WorkflowError(str(error)) from None
-RUN = Run(PLAN)
-if workflow.is_main_process and not makes_nothing(sys.argv[1:]):
-    RUN.refuse_unrecorded()
 
 IN_CONTAINER = (
     DeploymentMethod.APPTAINER in workflow.deployment_settings.deployment_method
