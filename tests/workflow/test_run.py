@@ -178,10 +178,18 @@ def test_a_killed_run_ends_with_the_same_model_when_started_again(
 ) -> None:
     copy_run(finished[0], workflow.folder)
     output = workflow.folder / "out" / "square"
-    shutil.rmtree(output / stage)
-    shutil.rmtree(output / "logs" / stage)
-    workflow.kill_when(lambda: (output / "logs" / stage).is_dir(), *config_of(small_scene), number=number)
-    assert not list((output / stage).glob("[!.]*.h5")) or stage != "adjust_bundle"
+    made = expected = len(list((finished[0] / stage).glob("*.h5")))
+    attempts = 0
+    # on a busy machine the stage may end before its start is noticed
+    while made == expected and attempts < 3:
+        attempts += 1
+        shutil.rmtree(output / stage)
+        shutil.rmtree(output / "logs" / stage)
+        workflow.kill_when(
+            lambda: (output / "logs" / stage).is_dir(), *config_of(small_scene), number=number
+        )
+        made = len(list((output / stage).glob("[!.]*.h5")))
+    assert made < expected
     outcome = workflow.run(*config_of(small_scene))
     assert outcome.status == 0, outcome.text
     assert stage in outcome.rules
