@@ -39,6 +39,8 @@ SCENE_ARTIFACTS = (
     "adjust_bundle/reconstruction.h5",
 )
 
+STAGES_WITH_NETWORKS = ("extract_features", "describe_images", "match_pairs")
+
 
 class ScenePlan:
     """One scene's blocks, tiles and what its stages are told."""
@@ -202,15 +204,11 @@ class ScenePlan:
         models = self.models(stage)
         if not models:
             return {}
-        # imported here, as most runs have no networks and every job parses the Snakefile
-        from snakesfm.learned.weights import weights_digest
-
-        names = ("extract_features", "describe_images", "match_pairs")
-        methods = {name: self.method(name) for name in names}
+        methods = {name: self.method(name) for name in STAGES_WITH_NETWORKS}
         return {
             "weights": str(self.weights),
             "models": models,
-            "weights_content": weights_digest(models, self.weights) if main_process else "",
+            "weights_content": self._weights_contents[stage] if main_process else "",
             "fetch": fetch_command(self.configuration.front_end, methods, str(self.weights)),
             "device": self.configuration.device,
         }
@@ -306,6 +304,14 @@ class ScenePlan:
         if self.select_pairs.needs_descriptors:
             files += [*self.vocabulary(), *self.files("describe_images", "blocks")]
         return files + self.final_files()
+
+    @functools.cached_property
+    def _weights_contents(self) -> dict[str, str]:
+        """A digest of each stage's weights, whose files are too large to be read once per job."""
+        # imported here, as most runs have no networks and every job parses the Snakefile
+        from snakesfm.learned.weights import weights_digest
+
+        return {stage: weights_digest(self.models(stage), self.weights) for stage in STAGES_WITH_NETWORKS}
 
     @functools.cached_property
     def _fingerprint(self) -> str:

@@ -45,8 +45,8 @@ def set_aside(
     Parameters
     ----------
     paths, scene, digests : as in :func:`check_inputs`.
-    settings : what a file of a stage should say of its seed and settings; empty if it may say anything. A
-        simulated one says nothing.
+    settings : what a file of a stage should say of its seed and settings; empty if it may say anything. One
+        that says nothing, as simulated ones do, is not refused for it.
 
     Returns
     -------

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from snakesfm.artifacts.images import ImageIndex
-from snakesfm.digests import settings_text
 from snakesfm.errors import ImageError, SceneError
 from snakesfm.geometry.camera import cameras_to_columns
 from snakesfm.ingest.cameras import ImageCameras, Photograph, assign_cameras
@@ -55,10 +54,9 @@ def run(job: StageJob) -> None:
         use_exif=options.use_exif_focal,
     )
     index = _to_index(photographs, [digests[p.name] for p in photographs], found, refused, job)
-    content = {"content": fingerprint(digests)}
-    index.write(
-        job.output, replace(job.header, settings=settings_text({**job.settings, **content}, job.seed))
-    )
+    # jobs are not told the content, for only the controller compares it
+    told = {**job.settings, "content": fingerprint(digests)}
+    index.write(job.output, replace(job, settings=told).header)
     _report(index)
 
 
