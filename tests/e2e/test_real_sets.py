@@ -60,3 +60,15 @@ def test_retrieval_on_a_real_sequence(data: Path, workflow: Workflow) -> None:
         "select_pairs={method: sequential+retrieval, look_ahead: 4, top_k: 4}",
     )
     check(metrics, (75.0, 90.0, 94.0))
+
+
+@pytest.mark.parametrize(("name", "view_points"), [("olsson_lund_door", 0), ("strecha_castle_p19", 300)])
+def test_exact_matches_give_exact_poses(
+    data: Path, workflow: Workflow, name: str, view_points: int
+) -> None:
+    folder = data / name
+    oracle = ("front_end=virtual", f"extract_features={{view_points: {view_points}}}")
+    metrics = metrics_of(workflow, folder, f"cameras={folder / 'reference'}", *oracle)
+    assert metrics["reference_images_registered"] == metrics["reference_images"]
+    assert 99.9 < metrics["pose_auc_1deg"] <= 100
+    assert 0 <= metrics["reprojection_error_px_mean"] < 1e-3

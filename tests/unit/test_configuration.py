@@ -28,6 +28,10 @@ from snakesfm.errors import ConfigError
         ({"blocks": 0}, ["'blocks' = 0", "greater than or equal to 1 (or 'auto')."]),
         ({"intrinsics": "free"}, ["intrinsics", "fixed", "refine"]),
         ({"zzzzqqqq": 1}, ["zzzzqqqq", "known keys"]),
+        (
+            {"extract_features": {"surface_points": 5, "view_points": 5}},
+            ["key 'extract_features': surface_points and view_points", "set one of them to 0."],
+        ),
     ],
 )
 def test_a_wrong_key_or_value_gives_one_sentence_that_names_it(values: dict, parts: list[str]) -> None:

@@ -189,7 +189,10 @@ def _one_sentence(cls: type[BaseModel], error: ValidationError) -> str:
         if other["type"] == "literal_error" and other["loc"][:-1] == first["loc"][:-1]
     ]
     message = message[:1].lower() + message[1:] + "".join(words)
-    return f"Configuration key '{key}' = {first['input']!r}: {message}."
+    # a check of several options together is handed the whole block
+    together = first["type"] == "value_error" and isinstance(first["input"], dict)
+    given = "" if together else f" = {first['input']!r}"
+    return f"Configuration key '{key}'{given}: {message}."
 
 
 def _keys_beside(cls: type[BaseModel], path: list[str]) -> list[str]:

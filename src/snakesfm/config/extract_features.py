@@ -1,8 +1,8 @@
 """Options of extract_features."""
 
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, ClassVar, Literal, Self
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from snakesfm.config.base import StageOptions
 
@@ -21,6 +21,9 @@ class ExtractFeaturesOptions(StageOptions):
     surface_points: int = Field(0, ge=0, le=1_000_000)
     """Points that 'virtual' takes from a surface through the reference's points (0: these themselves)."""
 
+    view_points: int = Field(0, ge=0, le=100_000)
+    """Points that 'virtual' spreads over each image's view, hidden by nothing (0: none)."""
+
     max_shorter_side_px: int = Field(760, ge=64, le=20_000)
     """Shorter side to which larger images are scaled down; keypoints stay in original pixels."""
 
@@ -32,3 +35,9 @@ class ExtractFeaturesOptions(StageOptions):
 
     edge_threshold: float = Field(10.0, ge=1.0, le=100.0)
     """Largest ratio of principal curvatures of a SIFT keypoint; lower refuses more points on edges."""
+
+    @model_validator(mode="after")
+    def _refuse_two_kinds_of_points(self) -> Self:
+        if self.surface_points and self.view_points:
+            raise ValueError("surface_points and view_points are two kinds of points: set one of them to 0")
+        return self

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from snakesfm.errors import ConfigError
 from snakesfm.features.keypoints import KeypointSet
-from snakesfm.features.surface import Surface
+from snakesfm.features.virtual_points import ObservedPoints, PointSource, SurfacePoints, ViewPoints
 from snakesfm.geometry.colmap_binding import pycolmap
 
 Array = NDArray[Any]
@@ -24,35 +24,40 @@ class VirtualKeypoints:
     errors alone (Li et al. 2026, "Distributed Global Structure-from-Motion with a Deep Front-End").
 
     With ``surface_points`` the points lie evenly on a surface through the model's points instead, and an
-    image sees those that the surface does not hide: many more, where a model's own points are few.
+    image sees those that the surface does not hide; with ``view_points`` they are spread over each image's
+    view, and nothing hides them: for models whose own points are few.
 
     Parameters
     ----------
-    model : COLMAP model with points.
-    surface_points : how many points lie on the surface; 0 for the model's own points.
+    model : COLMAP model; with points, unless ``view_points`` are asked for.
+    surface_points : how many points lie on the surface; 0 for none.
+    view_points : how many points each image's view gets; 0 for none.
 
     Raises
     ------
-    ConfigError : the model has no points, or there is no open3d for a surface.
+    ConfigError : the model has no points and ``view_points`` is 0, or there is no open3d for a surface.
     """
 
     descriptor_size = 4
     descriptor_dtype: Any = np.uint8
     usual_keypoints = 100_000
 
-    def __init__(self, model: pycolmap.Reconstruction, surface_points: int = 0) -> None:
-        if not model.points3D:
+    def __init__(
+        self, model: pycolmap.Reconstruction, surface_points: int = 0, view_points: int = 0
+    ) -> None:
+        if not model.points3D and not view_points:
             raise ConfigError(
-                "The reference model has no points, which the front-end 'virtual' needs: "
-                "give reference=PATH of a model with points, or take another front_end."
+                "The reference model has no points, which the front-end 'virtual' needs: give "
+                "reference=PATH of a model with points, extract_features.view_points=300 for points at "
+                "random depths, or another front_end."
             )
         self._images = {image.name: image for image in model.images.values()}
         self._cameras = model.cameras
-        self._points = model.points3D
-        self._surface = None
+        self._points: PointSource = ObservedPoints(model)
         if surface_points:
-            points = np.array([model.points3D[number].xyz for number in sorted(model.points3D)])
-            self._surface = Surface(points, surface_points, seed=0)
+            self._points = SurfacePoints(model, surface_points)
+        elif view_points:
+            self._points = ViewPoints(model, view_points)
 
     def read(self, name: str, size: tuple[int, int]) -> KeypointSet:
         """See :class:`snakesfm.features.keypoints.KeypointSource`; an image without a pose has none."""
@@ -60,7 +65,7 @@ class VirtualKeypoints:
         if image is None or not image.has_pose:
             return KeypointSet.empty(self.descriptor_size, self.descriptor_dtype)
         pose, camera = image.cam_from_world(), self._cameras[image.camera_id]
-        ids, points, lengths = self._seen(image, pose)
+        ids, points, scores = self._points.seen_by(image)
         local = points @ pose.rotation.matrix().T + pose.translation
         scale = np.array(size) / [camera.width, camera.height]
         ahead = local[:, 2] > 0
@@ -75,20 +80,8 @@ class VirtualKeypoints:
         return KeypointSet(
             places[inside].astype(np.float32),
             ids[inside].astype("<u4").view(np.uint8).reshape(-1, 4),
-            lengths[inside],
+            scores[inside],
             np.ones(count, np.float32),
             np.zeros(count, np.float32),
             size,
         )
-
-    def _seen(self, image: pycolmap.Image, pose: pycolmap.Rigid3d) -> tuple[Array, Array, Array]:
-        """Numbers (N,) uint32, places (N,3) and track lengths (N,) float32 of what an image sees."""
-        if self._surface is not None:
-            center = -pose.rotation.matrix().T @ pose.translation
-            ids = np.flatnonzero(self._surface.seen_from(center)).astype(np.uint32)
-            return ids, self._surface.points[ids], np.ones(len(ids), np.float32)
-        numbers = [point.point3D_id for point in image.points2D if point.has_point3D()]
-        ids = np.unique(numbers).astype(np.uint32)
-        points = np.array([self._points[number].xyz for number in ids.tolist()]).reshape(-1, 3)
-        lengths = np.array([self._points[number].track.length() for number in ids.tolist()], np.float32)
-        return ids, points, lengths

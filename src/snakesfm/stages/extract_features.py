@@ -78,7 +78,7 @@ def _create_finder(job: StageJob, options: "ExtractFeaturesOptions") -> Detector
         from snakesfm.features.virtual import VirtualKeypoints
 
         model = read_model(Path(job.settings["reference"]))
-        return VirtualKeypoints(model, options.surface_points)
+        return VirtualKeypoints(model, options.surface_points, options.view_points)
     if options.method == "imported":
         return ImportedKeypoints(Path(job.settings["imported"]) / FEATURES)
     if options.method == "sift":

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from benchmarks.compare.sets import ImageSet
-from benchmarks.front_ends import COMPARED, DEGREES, ORACLE, USUAL, measure, render
+from benchmarks.front_ends import COMPARED, DEGREES, ORACLE, USUAL, options_of, render
 from benchmarks.on_sets import Run, SetTable
 from snakesfm.synthetic.render_demo import make_demo
 from snakesfm.synthetic.scene import DemoOptions
@@ -22,26 +22,28 @@ def test_rows_means_failures_and_gaps() -> None:
     values = {
         "a|sift": value(80.0),
         "a|disk+lightglue": value(70.0),
-        "a|virtual": {"failure": "the reference has no points"},
+        "a|virtual": {"failure": "no points"},
         "b|sift": value(60.0),
         "b|disk+lightglue": {"failure": "no memory"},
     }
     text = render(values, ["a", "b"], ["sift", "disk+lightglue", "virtual"])
     assert "| sift | 80.0 | 80.0 | 80.0 | 80.0 | 80.0 | 4 of 5 | 3.3 | 12 |" in text
-    assert "| disk+lightglue | no memory |" in text and "| virtual | the reference has no points |" in text
+    assert "| disk+lightglue | no memory |" in text and "| virtual | no points |" in text
     # only set a was finished by both, and the oracle takes no part
     assert "## Mean of 1 sets" in text and text.count("| sift | 80.0") == 2
     assert text.count("| virtual |") == 2 and "not run" in render({}, ["a"], ["sift"])
 
 
-def test_the_oracle_needs_points(tmp_path: Path) -> None:
+def test_the_oracle_spreads_points_where_a_reference_has_none(tmp_path: Path) -> None:
     assert ORACLE in USUAL and set(USUAL) <= set(COMPARED) and "imported" not in COMPARED
     make_demo(tmp_path / "a", DemoOptions(image_count=8, width=64, height=48))
+    image_set = ImageSet(tmp_path / "a", False, False)
+    assert options_of(ORACLE, image_set) == ["front_end=virtual"]
     (tmp_path / "a" / "reference" / "points3D.txt").write_text("")
     for file in (tmp_path / "a" / "reference").glob("points3D.bin"):
         file.unlink()
-    nothing = measure(ImageSet(tmp_path / "a", False, False), ORACLE, Run(tmp_path, (), 1, 60))
-    assert nothing == {"failure": "the reference has no points"}
+    assert options_of(ORACLE, image_set) == ["front_end=virtual", "extract_features={view_points: 300}"]
+    assert options_of("sift", image_set) == ["front_end=sift"]
 
 
 def test_what_is_there_is_not_measured_again(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:

@@ -8,6 +8,7 @@ from snakesfm.errors import ConfigError
 from snakesfm.evaluation.colmap_model import read_model
 from snakesfm.features.keypoints import KeypointSource
 from snakesfm.features.virtual import VirtualKeypoints
+from snakesfm.features.virtual_points import ViewPoints
 from snakesfm.matching.matcher import create_matcher
 
 SIZE = (1024, 768)
@@ -57,9 +58,56 @@ def test_the_matcher_pairs_the_same_points_and_no_others(model):
     assert matcher.match(matcher.prepare(nothing), matcher.prepare_second(second))[0].shape == (0, 2)
 
 
-def test_a_model_without_points_is_refused():
+def test_points_spread_over_the_views_are_seen_wherever_they_project(model):
+    source = VirtualKeypoints(model, view_points=40)
+    seen = {}
+    for image in model.images.values():
+        found = source.read(image.name, SIZE)
+        seen[image.name] = dict(zip(map(bytes, found.descriptors), found.keypoints, strict=True))
+        # its own 40 lie in its view, and of the other three images' some
+        assert 40 <= len(found) <= 160
+    assert len(set().union(*seen.values())) == 160
+    again = VirtualKeypoints(model, view_points=40).read(image.name, SIZE)
+    np.testing.assert_array_equal(again.keypoints, found.keypoints)
+    first, second = list(model.images.values())[:2]
+    shared = sorted(seen[first.name].keys() & seen[second.name].keys())
+    assert len(shared) > 20
+    rays = [
+        image.camera.cam_from_img(np.array([seen[image.name][number] for number in shared], float))
+        for image in (first, second)
+    ]
+    relative = second.cam_from_world() * first.cam_from_world().inverse()
+    essential = pycolmap.essential_matrix_from_pose(relative)
+    one, other = (np.column_stack([part, np.ones(len(part))]) for part in rays)
+    np.testing.assert_allclose(np.einsum("ni,ij,nj->n", other, essential, one), 0, atol=1e-5)
+
+
+def test_points_of_a_view_are_as_deep_as_what_the_image_observes(tmp_path):
+    (tmp_path / "cameras.txt").write_text("1 SIMPLE_PINHOLE 1000 800 1000 500 400\n")
+    (tmp_path / "images.txt").write_text(
+        "1 1 0 0 0 0 0 0 1 a.jpg\n250 400 1 750 400 2\n2 1 0 0 0 0 0 0 1 b.jpg\n\n"
+    )
+    (tmp_path / "points3D.txt").write_text("1 -0.5 0 2 9 9 9 0 1 0\n2 1 0 4 9 9 9 0 1 1\n")
+    found = ViewPoints(read_model(tmp_path), 500).seen_by(read_model(tmp_path).images[1])
+    # image b observes nothing, so it spreads nothing
+    assert found.places.shape == (500, 3)
+    np.testing.assert_array_equal(found.places[:, 2], np.where(found.places[:, 0] < 0, 2.0, 4.0))
+    assert 200 < (found.places[:, 0] < 0).sum() < 300
+
+
+def test_a_model_without_points_is_refused_unless_they_are_spread(tmp_path):
     with pytest.raises(ConfigError, match="has no points"):
         VirtualKeypoints(pycolmap.Reconstruction())
+    (tmp_path / "cameras.txt").write_text("1 SIMPLE_PINHOLE 1000 800 1000 500 400\n")
+    (tmp_path / "images.txt").write_text(
+        "1 1 0 0 0 0 0 0 1 a.jpg\n\n2 1 0 0 0 -0.1 0 0 1 b.jpg\n\n3 1 0 0 0 -0.1 0 0 1 c.jpg\n\n"
+    )
+    (tmp_path / "points3D.txt").write_text("")
+    model = read_model(tmp_path)
+    depths = ViewPoints(model, 400).seen_by(model.images[1]).places[:, 2]
+    # b and c are in one place, and the nearest other camera is 0.1 away for each
+    assert len(depths) == 1200 and 0.2 <= depths.min() < 0.25 and 4 < depths.max() <= 5
+    assert len(VirtualKeypoints(model, view_points=400).read("a.jpg", (1000, 800))) > 1000
 
 
 def test_points_that_distortion_folds_into_the_image_are_not_seen(tmp_path):
