@@ -43,12 +43,12 @@ def gather_image_columns(paths: Sequence[Path], count: int, *columns: str) -> li
 
 
 def gather_inlier_matches(paths: Sequence[Path], pairs: Array | None = None) -> tuple[Array, Array, Array]:
-    """Inlier matches of accepted pairs of all tiles, sorted by pair.
+    """Inlier matches of pairs of all tiles, sorted by pair.
 
     Parameters
     ----------
     paths : the TwoViewGeometries files of all tiles.
-    pairs : (E,2) the pairs that are wanted; None for all accepted ones.
+    pairs : (E,2) the pairs that are wanted, refused ones too; None for all accepted ones.
 
     Returns
     -------
@@ -60,7 +60,7 @@ def gather_inlier_matches(paths: Sequence[Path], pairs: Array | None = None) -> 
         with TwoViewGeometries.open(path) as file:
             tile, rejections = file["pairs"][()], file["rejections"][()]
             offsets, inliers = file["offsets"][()], file["inliers"][()]
-        for row in np.nonzero(rejections == 0)[0]:
+        for row in np.nonzero(rejections == 0 if wanted is None else np.diff(offsets) > 0)[0]:
             pair = (int(tile[row, 0]), int(tile[row, 1]))
             if wanted is None or pair in wanted:
                 parts.append((pair, inliers[offsets[row] : offsets[row + 1]]))
@@ -69,3 +69,18 @@ def gather_inlier_matches(paths: Sequence[Path], pairs: Array | None = None) -> 
     starts = np.r_[0, np.cumsum([len(matches) for _, matches in parts])].astype(np.int64)
     matches = np.concatenate([matches for _, matches in parts] or [np.zeros((0, 2), dtype=np.int32)])
     return rows, starts, matches
+
+
+def gather_refused_pairs(paths: Sequence[Path]) -> Array:
+    """Pairs (P,2) int32 of all tiles whose matches agree with a pose that was refused all the same.
+
+    Parameters
+    ----------
+    paths : the TwoViewGeometries files of all tiles.
+    """
+    found = [np.zeros((0, 2), dtype=np.int32)]
+    for path in paths:
+        with TwoViewGeometries.open(path) as file:
+            refused = (file["rejections"][()] != 0) & (file["inlier_counts"][()] > 0)
+            found.append(file["pairs"][()][refused])
+    return np.concatenate(found)

@@ -10,7 +10,7 @@ from snakesfm.config.base import StageOptions
 class AdjustBundleOptions(StageOptions):
     """How cameras, poses and points are adjusted together."""
 
-    stage_version: ClassVar[int] = 10
+    stage_version: ClassVar[int] = 11
 
     solver: Literal["ceres", "gtsam"] = "ceres"
     """Least-squares solver: Ceres through pycolmap, or gtsam (slower, fewer camera models)."""
@@ -74,6 +74,9 @@ class AdjustBundleOptions(StageOptions):
 
     complete_error_px: float = Field(default=4.0, gt=0.0)
     """Largest reprojection error of an observation that completion adds."""
+
+    complete_refused_pairs: bool = True
+    """Complete by the matches of pairs too whose pose was refused, where both images have one."""
 
     refine_keypoints: Literal["auto"] | bool = "auto"
     """Move each point's observations to where pixels agree best; 'auto': if most images share a camera."""

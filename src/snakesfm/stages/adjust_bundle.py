@@ -9,7 +9,7 @@ import cv2  # must be loaded before pycolmap, whose PNG library clashes otherwis
 import numpy as np
 import pycolmap
 
-from snakesfm.artifacts.gather import gather_image_columns, gather_inlier_matches
+from snakesfm.artifacts.gather import gather_image_columns, gather_inlier_matches, gather_refused_pairs
 from snakesfm.artifacts.images import CalibratedCameras, ImageIndex
 from snakesfm.artifacts.mapping import CameraCenters, CameraRotations, Reconstruction, TriangulatedPoints
 from snakesfm.artifacts.pairs import ViewGraph
@@ -111,6 +111,9 @@ def _adjust(
     options: AdjustBundleOptions = job.options
     reconstruction = _start(job, poses, index.names.tolist())
     pairs = _usable_pairs(view_graph, poses)
+    if options.complete_refused_pairs:
+        refused = gather_refused_pairs(job.paths("geometries"))
+        pairs = np.concatenate([pairs, refused[poses.registered[refused].all(axis=1)]])
     pairs = pairs[~taken[pairs].any(axis=1)]
 
     def read_graph() -> pycolmap.CorrespondenceGraph:

@@ -10,8 +10,10 @@ from snakesfm.artifacts import (
     Reconstruction,
     TrackTable,
     TriangulatedPoints,
+    TwoViewGeometries,
     ViewGraph,
 )
+from snakesfm.artifacts.pairs import REJECTIONS
 from snakesfm.config.adjust_bundle import AdjustBundleOptions
 from snakesfm.config.build_tracks import BuildTracksOptions
 from snakesfm.config.triangulate_tracks import TriangulateTracksOptions
@@ -112,3 +114,32 @@ def test_poses_that_fit_nothing_are_named(inputs):
     CameraCenters(**columns).write(inputs["centers"], HEADER)
     with pytest.raises(SceneError, match="none of"):
         run(triangulate_tracks, TriangulateTracksOptions(), inputs, inputs["points"])
+
+
+def test_matches_of_refused_pairs_bring_observations_where_the_model_agrees(made, inputs, tmp_path):
+    graph = ViewGraph.read(inputs["graph"])
+    # every third pair has matches but no pose that was believed
+    accepted = np.arange(len(graph.pairs)) % 3 != 1
+    edges = {
+        name: value[accepted] if len(value) == len(accepted) else value
+        for name, value in vars(graph).items()
+    }
+    ViewGraph(**edges).write(inputs["graph"], HEADER)
+    rotations = CameraRotations.read(inputs["rotations"])
+    CameraRotations(
+        rotations.rotations, np.zeros(accepted.sum()), np.zeros(accepted.sum(), int), rotations.components
+    ).write(inputs["rotations"], HEADER)
+    refused_pairs = set(map(tuple, graph.pairs[~accepted].tolist()))
+    for path in inputs["geometries"]:
+        columns = dict(vars(TwoViewGeometries.read(path)))
+        refused = np.array([tuple(pair) in refused_pairs for pair in columns["pairs"].tolist()], bool)
+        columns["rejections"] = np.where(refused, REJECTIONS.index("ambiguous"), 0).astype(np.int8)
+        TwoViewGeometries(**columns).write(path, HEADER)
+    found = {}
+    for used in (True, False):
+        model = run_all(inputs, tmp_path, f"{used}.h5", complete_refused_pairs=used)
+        found[used] = np.diff(model.offsets)
+        assert np.isfinite(model.rotations[:, 0, 0]).sum() >= COUNT - 1
+        assert 0.15 < np.average(model.errors_px, weights=found[used]) < 0.6
+    assert len(refused_pairs) > 5
+    assert 1.1 < found[True].sum() / found[False].sum() < 2
