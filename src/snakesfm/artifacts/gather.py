@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from snakesfm.artifacts.features import LocalFeatures
-from snakesfm.artifacts.pairs import TwoViewGeometries
+from snakesfm.artifacts.pairs import REJECTIONS, TwoViewGeometries
 
 Array = NDArray[Any]
 
@@ -74,6 +74,8 @@ def gather_inlier_matches(paths: Sequence[Path], pairs: Array | None = None) -> 
 def gather_refused_pairs(paths: Sequence[Path]) -> Array:
     """Pairs (P,2) int32 of all tiles whose matches agree with a pose that was refused all the same.
 
+    Ambiguous pairs are left out: their matches may be those of the wrong pose of two.
+
     Parameters
     ----------
     paths : the TwoViewGeometries files of all tiles.
@@ -81,6 +83,6 @@ def gather_refused_pairs(paths: Sequence[Path]) -> Array:
     found = [np.zeros((0, 2), dtype=np.int32)]
     for path in paths:
         with TwoViewGeometries.open(path) as file:
-            refused = (file["rejections"][()] != 0) & (file["inlier_counts"][()] > 0)
-            found.append(file["pairs"][()][refused])
+            refused = ~np.isin(file["rejections"][()], (0, REJECTIONS.index("ambiguous")))
+            found.append(file["pairs"][()][refused & (file["inlier_counts"][()] > 0)])
     return np.concatenate(found)

@@ -76,7 +76,7 @@ class AdjustBundleOptions(StageOptions):
     """Largest reprojection error of an observation that completion adds."""
 
     complete_refused_pairs: bool = True
-    """Complete by the matches of pairs too whose pose was refused, where both images have one."""
+    """Complete by the matches of refused pairs too, but for ambiguous ones, whose pose may be wrong."""
 
     refine_keypoints: Literal["auto"] | bool = "auto"
     """Move each point's observations to where pixels agree best; 'auto': if most images share a camera."""

@@ -130,16 +130,18 @@ def test_matches_of_refused_pairs_bring_observations_where_the_model_agrees(made
         rotations.rotations, np.zeros(accepted.sum()), np.zeros(accepted.sum(), int), rotations.components
     ).write(inputs["rotations"], HEADER)
     refused_pairs = set(map(tuple, graph.pairs[~accepted].tolist()))
-    for path in inputs["geometries"]:
-        columns = dict(vars(TwoViewGeometries.read(path)))
-        refused = np.array([tuple(pair) in refused_pairs for pair in columns["pairs"].tolist()], bool)
-        columns["rejections"] = np.where(refused, REJECTIONS.index("ambiguous"), 0).astype(np.int8)
-        TwoViewGeometries(**columns).write(path, HEADER)
     found = {}
-    for used in (True, False):
-        model = run_all(inputs, tmp_path, f"{used}.h5", complete_refused_pairs=used)
-        found[used] = np.diff(model.offsets)
+    for case in (("not_significant", True), ("not_significant", False), ("ambiguous", True)):
+        for path in inputs["geometries"]:
+            columns = dict(vars(TwoViewGeometries.read(path)))
+            refused = np.array([tuple(pair) in refused_pairs for pair in columns["pairs"].tolist()], bool)
+            columns["rejections"] = np.where(refused, REJECTIONS.index(case[0]), 0).astype(np.int8)
+            TwoViewGeometries(**columns).write(path, HEADER)
+        model = run_all(inputs, tmp_path, f"{case[0]}{case[1]}.h5", complete_refused_pairs=case[1])
+        found[case] = np.diff(model.offsets)
         assert np.isfinite(model.rotations[:, 0, 0]).sum() >= COUNT - 1
-        assert 0.15 < np.average(model.errors_px, weights=found[used]) < 0.6
+        assert 0.15 < np.average(model.errors_px, weights=found[case]) < 0.6
     assert len(refused_pairs) > 5
-    assert 1.1 < found[True].sum() / found[False].sum() < 2
+    more, without, ambiguous = found.values()
+    assert 1.1 < more.sum() / without.sum() < 2
+    np.testing.assert_array_equal(ambiguous, without)
