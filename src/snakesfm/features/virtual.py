@@ -53,20 +53,22 @@ class VirtualKeypoints:
             )
         self._images = {image.name: image for image in model.images.values()}
         self._cameras = model.cameras
-        self._points: PointSource = ObservedPoints(model)
+        self._points: PointSource
         if surface_points:
             self._points = SurfacePoints(model, surface_points)
         elif view_points:
             self._points = ViewPoints(model, view_points)
+        else:
+            self._points = ObservedPoints(model)
 
     def read(self, name: str, size: tuple[int, int]) -> KeypointSet:
         """See :class:`snakesfm.features.keypoints.KeypointSource`; an image without a pose has none."""
         image = self._images.get(name)
         if image is None or not image.has_pose:
             return KeypointSet.empty(self.descriptor_size, self.descriptor_dtype)
-        pose, camera = image.cam_from_world(), self._cameras[image.camera_id]
+        camera = self._cameras[image.camera_id]
         ids, points, scores = self._points.seen_by(image)
-        local = points @ pose.rotation.matrix().T + pose.translation
+        local = image.cam_from_world() * points
         scale = np.array(size) / [camera.width, camera.height]
         ahead = local[:, 2] > 0
         places = np.full((len(ids), 2), -1.0)

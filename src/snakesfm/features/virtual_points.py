@@ -4,11 +4,15 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from snakesfm.features.surface import Surface
 from snakesfm.geometry.colmap_binding import pycolmap
 
 Array = NDArray[Any]
+
+# of a point where an image observes none, times the distance to the nearest other camera
+DEPTHS = (2.0, 50.0)
 
 
 class SeenPoints(NamedTuple):
@@ -81,38 +85,43 @@ class ViewPoints:
     count : points per image.
     """
 
-    DEPTHS = (2.0, 50.0)
-
     def __init__(self, model: pycolmap.Reconstruction, count: int) -> None:
-        self._observed = ObservedPoints(model)
-        self._rng = np.random.default_rng(0)
+        observed = ObservedPoints(model)
+        rng = np.random.default_rng(0)
         images = [model.images[number] for number in sorted(model.images) if model.images[number].has_pose]
         centers = np.array([image.projection_center() for image in images]).reshape(-1, 3)
-        spread = [self._spread(image, centers, count) for image in images]
-        points = np.concatenate([np.zeros((0, 3)), *spread])
+        spread = [_spread(image, observed.seen_by(image).places, centers, count, rng) for image in images]
         # an image that sees too many keeps the lowest numbers, which must not all be of the same views
-        self._points = self._rng.permutation(points)
+        self._points = rng.permutation(np.concatenate([np.zeros((0, 3)), *spread]))
 
     def seen_by(self, image: pycolmap.Image) -> SeenPoints:
         """See :class:`PointSource`."""
         count = len(self._points)
         return SeenPoints(np.arange(count, dtype=np.uint32), self._points, np.ones(count, np.float32))
 
-    def _spread(self, image: pycolmap.Image, centers: Array, count: int) -> Array:
-        """Places (N,3) in the world of up to ``count`` points over an image's view."""
-        camera, pose = image.camera, image.cam_from_world()
-        pixels = self._rng.uniform(0, [camera.width, camera.height], (count, 2))
-        observed = self._observed.seen_by(image).places
-        local = observed @ pose.rotation.matrix().T + pose.translation
-        local = local[local[:, 2] > 0]
-        if len(local):
-            distances = np.linalg.norm(pixels[:, None] - camera.img_from_cam(local)[None], axis=2)
-            depths = local[distances.argmin(axis=1), 2]
-        else:
-            apart = np.linalg.norm(centers - image.projection_center(), axis=1)
-            nearest = apart[apart > 0].min(initial=np.inf)
-            low, high = self.DEPTHS
-            depths = low * (high / low) ** self._rng.uniform(size=count) * nearest
-        points = np.column_stack([camera.cam_from_img(pixels), np.ones(count)]) * depths[:, None]
-        points = points[np.isfinite(points).all(axis=1)]
-        return np.asarray((points - pose.translation) @ pose.rotation.matrix())
+
+def _spread(
+    image: pycolmap.Image, observed: Array, centers: Array, count: int, rng: np.random.Generator
+) -> Array:
+    """Places (N,3) in the world of up to ``count`` points over an image's view.
+
+    Parameters
+    ----------
+    image : with a pose.
+    observed : (K,3) places of the points that it observes.
+    centers : (I,3) of all cameras.
+    """
+    camera, pose = image.camera, image.cam_from_world()
+    pixels = rng.uniform(0, [camera.width, camera.height], (count, 2))
+    local = pose * observed
+    local = local[local[:, 2] > 0]
+    places = camera.img_from_cam(local)
+    shown = np.isfinite(places).all(axis=1)
+    if shown.any():
+        depths = local[shown][cKDTree(places[shown]).query(pixels)[1], 2]
+    else:
+        apart = np.linalg.norm(centers - image.projection_center(), axis=1)
+        low, high = DEPTHS
+        depths = low * (high / low) ** rng.uniform(size=count) * apart[apart > 0].min(initial=np.inf)
+    points = np.column_stack([camera.cam_from_img(pixels), np.ones(count)]) * depths[:, None]
+    return np.asarray(pose.inverse() * points[np.isfinite(points).all(axis=1)])

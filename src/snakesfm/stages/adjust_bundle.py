@@ -67,6 +67,7 @@ def run(job: StageJob) -> None:
         keypoint_ids=np.zeros(0, np.int32),
     )
     graph = ViewGraph.read(job.path("graph"))
+    refused = gather_refused_pairs(job.paths("geometries") if job.options.complete_refused_pairs else [])
     cameras, taken = poses.cameras, np.zeros(len(index.names), dtype=bool)
     adjusted: list[tuple[BundleModel, np.ndarray]] = []
     records: list[RoundRecord] = []
@@ -75,7 +76,7 @@ def run(job: StageJob) -> None:
         if part.registered.sum() < (SMALLEST_FURTHER_MODEL if component else 2):
             continue
         prefix = f"part {component + 1}, " if component else ""
-        result, observed, rounds = _adjust(job, index, part, graph, taken, prefix)
+        result, observed, rounds = _adjust(job, index, part, graph, refused, taken, prefix)
         records += rounds
         cameras = result.cameras
         if result.registered.sum() >= 2:
@@ -97,6 +98,7 @@ def _adjust(
     index: ImageIndex,
     poses: BundleModel,
     view_graph: ViewGraph,
+    refused: np.ndarray,
     taken: np.ndarray,
     prefix: str,
 ) -> tuple[BundleModel, np.ndarray, list[RoundRecord]]:
@@ -105,15 +107,15 @@ def _adjust(
     Parameters
     ----------
     poses : cameras and poses to start from, without points.
+    refused : (P,2) pairs beside the graph's edges whose matches complete tracks.
     taken : (N,) bool, images of other models: they stay where they are, and so do their cameras.
     prefix : goes before the names of the rounds.
     """
     options: AdjustBundleOptions = job.options
     reconstruction = _start(job, poses, index.names.tolist())
-    pairs = _usable_pairs(view_graph, poses)
-    if options.complete_refused_pairs:
-        refused = gather_refused_pairs(job.paths("geometries"))
-        pairs = np.concatenate([pairs, refused[poses.registered[refused].all(axis=1)]])
+    pairs = np.concatenate(
+        [_usable_pairs(view_graph, poses), refused[poses.registered[refused].all(axis=1)]]
+    )
     pairs = pairs[~taken[pairs].any(axis=1)]
 
     def read_graph() -> pycolmap.CorrespondenceGraph:
