@@ -1,7 +1,7 @@
 """What is taken out of the model between rounds: observations, points, images, and intrinsics gone wild."""
 
 import heapq
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 import cv2  # noqa: F401 - must be loaded before pycolmap, whose PNG library clashes otherwise
 import pycolmap
@@ -65,6 +65,40 @@ def deregister_weak_images(reconstruction: pycolmap.Reconstruction, min_observat
     return taken
 
 
+def usual_focal_px(camera: Camera) -> float:
+    """The focal length of a lens that is neither wide nor long, for images of the camera's size."""
+    return USUAL_FOCAL_RATIO * max(camera.width, camera.height)
+
+
+def is_guessed(camera: Camera) -> bool:
+    """Whether a focal length is neither given nor from EXIF."""
+    return camera.source not in ("given", "exif")
+
+
+def deregister_images_alone(
+    reconstruction: pycolmap.Reconstruction, camera_ids: Collection[int]
+) -> frozenset[int]:
+    """Take out those images of the cameras that no other registered image shares a camera with.
+
+    Returns
+    -------
+    Ids of the cameras that still have images.
+    """
+    shared = set()
+    for camera_id in camera_ids:
+        images = images_of(reconstruction, camera_id)
+        if len(images) == 1:
+            reconstruction.deregister_frame(reconstruction.image(images[0]).frame_id)
+        elif images:
+            shared.add(camera_id)
+    return frozenset(shared)
+
+
+def images_of(reconstruction: pycolmap.Reconstruction, camera_id: int) -> list[int]:
+    """Ids of the registered images of a camera."""
+    return [k for k in reconstruction.reg_image_ids() if reconstruction.image(k).camera_id == camera_id]
+
+
 def reset_wild_cameras(
     reconstruction: pycolmap.Reconstruction,
     cameras: Sequence[Camera],
@@ -87,11 +121,11 @@ def reset_wild_cameras(
     for row, start in enumerate(cameras):
         camera = reconstruction.camera(row + 1)
         focal = camera.mean_focal_length()
-        usual = USUAL_FOCAL_RATIO * max(start.width, start.height)
-        if start.source in ("given", "exif"):
-            change, most = focal / start.focal_px, max_focal_change
-        else:
+        usual = usual_focal_px(start)
+        if is_guessed(start):
             change, most = focal / usual, max_guessed_focal_change
+        else:
+            change, most = focal / start.focal_px, max_focal_change
         # distortion counts in squared tangents, which are small in a narrow view
         narrow = max(1.0, focal / usual) ** 2
         extra = camera.extra_params_idxs()

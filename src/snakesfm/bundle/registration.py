@@ -1,17 +1,17 @@
 """Registration of images that averaging left out, by their matches to points of the model."""
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import cv2  # noqa: F401 - must be loaded before pycolmap, whose PNG library clashes otherwise
 import numpy as np
-import poselib
 import pycolmap
 from numpy.typing import NDArray
 
+from snakesfm.bundle.filtering import images_of
 from snakesfm.bundle.reading import observations_of
-from snakesfm.geometry.poses import to_rigid3d
+from snakesfm.bundle.resection import resect
 
 Array = NDArray[Any]
 
@@ -22,13 +22,13 @@ def register_left_out(
     max_error_px: float,
     min_inliers: int,
     min_ratio: float,
+    max_focals_px: Mapping[int, float],
     seed: int,
     refused: Collection[int] = (),
 ) -> list[int]:
     """Register the images that have enough matches to points, most matches first, in one pass.
 
-    Absolute pose by LO-RANSAC over P3P with a final refinement (poselib). The inlier matches become
-    observations.
+    The inlier matches of the pose that :func:`snakesfm.bundle.resection.resect` finds become observations.
 
     Parameters
     ----------
@@ -36,6 +36,8 @@ def register_left_out(
     graph : inlier matches, also of the images that are left out.
     max_error_px : largest reprojection error of an inlier.
     min_inliers, min_ratio : what a pose must have to be accepted.
+    max_focals_px : by the id of a camera, how long a focal length may be found for it, if no registered
+        image has it; the cameras that are not named keep theirs.
     seed : of RANSAC.
     refused : rows of images that are not tried.
 
@@ -61,7 +63,18 @@ def register_left_out(
     for image_id in sorted(left_out, key=lambda image: (-len(found[image]), image)):
         if len(found[image_id]) < min_inliers:
             continue
-        if _register(reconstruction, image_id, found[image_id], max_error_px, min_inliers, min_ratio, seed):
+        camera_id = reconstruction.image(image_id).camera_id
+        max_focal_px = 0.0 if images_of(reconstruction, camera_id) else max_focals_px.get(camera_id, 0.0)
+        if _register(
+            reconstruction,
+            image_id,
+            found[image_id],
+            max_error_px,
+            min_inliers,
+            min_ratio,
+            max_focal_px,
+            seed,
+        ):
             done.append(image_id - 1)
     return done
 
@@ -132,31 +145,19 @@ def _register(
     max_error_px: float,
     min_inliers: int,
     min_ratio: float,
+    max_focal_px: float,
     seed: int,
 ) -> bool:
     image = reconstruction.image(image_id)
     camera = reconstruction.camera(image.camera_id)
     pixels = np.array([image.point2D(int(row)).xy for row in matched[:, 0]])
     points = np.array([reconstruction.point3D(int(point)).xyz for point in matched[:, 1]])
-    description = {
-        "model": camera.model_name,
-        "width": camera.width,
-        "height": camera.height,
-        "params": list(camera.params),
-    }
-    pose, info = poselib.estimate_absolute_pose(
-        pixels,
-        points,
-        description,
-        {"max_reproj_error": max_error_px, "seed": seed},
-        {"loss_type": "CAUCHY", "loss_scale": 1.0},
-    )
-    inliers = np.asarray(info["inliers"], dtype=bool)
-    if inliers.sum() < max(min_inliers, min_ratio * len(matched)):
+    found = resect(camera, pixels, points, max_error_px, max_focal_px, seed)
+    if found.support < max(min_inliers, min_ratio * len(matched)):
         return False
-    rigid = to_rigid3d(pose.R, pose.t)
-    image.frame.set_cam_from_world(image.camera_id, rigid)
+    camera.params = found.camera.params
+    image.frame.set_cam_from_world(image.camera_id, found.pose)
     reconstruction.register_frame(image.frame_id)
-    for row, point, _ in matched[inliers].tolist():
+    for row, point, _ in matched[found.inliers].tolist():
         reconstruction.add_observation(point, pycolmap.TrackElement(image_id, row))
     return True

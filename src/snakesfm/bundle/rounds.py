@@ -12,10 +12,13 @@ from numpy.typing import NDArray
 from snakesfm.bundle.alignment import AlignmentSettings, GrayImage
 from snakesfm.bundle.completion import TrackCompleter
 from snakesfm.bundle.filtering import (
+    deregister_images_alone,
     deregister_weak_images,
     drop_short_tracks,
     filter_observations,
+    is_guessed,
     reset_wild_cameras,
+    usual_focal_px,
 )
 from snakesfm.bundle.interface import BundleAdjuster, Loss, SolverSettings
 from snakesfm.bundle.keypoint_refinement import refine_keypoints
@@ -89,7 +92,10 @@ class ImageSource:
 
 @dataclass(frozen=True)
 class RoundRecord:
-    """What one round did: robust costs before and after, and the model's size and mean error after it."""
+    """What one round did: robust costs before and after, and the model's size and mean error after it.
+
+    Where nothing was adjusted, the costs are that of the pass before.
+    """
 
     name: str
     costs: tuple[float, float]
@@ -149,6 +155,8 @@ def adjust_rounds(
         mapper.refine_principal_points()
     mapper.drop_outliers()
     mapper.round("last pass", settings.thresholds_px[-1], "last")
+    if settings.register_images:
+        mapper.add_left_out()
     return mapper.records
 
 
@@ -213,7 +221,11 @@ class _Mapper:
             settings.max_guessed_focal_change,
             settings.max_distortion,
         )
-        if wild:
+        if wild and phase == "last":
+            # no pass is left in which they could come back: their images are added to the finished model
+            wild = deregister_images_alone(self.reconstruction, wild)
+            costs = self.solve(replace(solving, constant_cameras=solving.constant_cameras | wild), phase)
+        elif wild:
             held = solving.constant_cameras | wild
             costs = self.solve(replace(solving, constant_cameras=held), phase)
         filter_observations(
@@ -221,6 +233,10 @@ class _Mapper:
         )
         if phase != "early":
             deregister_weak_images(self.reconstruction, settings.min_observations)
+        self.record(name, costs)
+
+    def record(self, name: str, costs: tuple[float, float]) -> None:
+        """Take down what was done, and report it."""
         self.reconstruction.update_point_3d_errors()
         record = RoundRecord(
             name,
@@ -310,6 +326,7 @@ class _Mapper:
             settings.register_error_px,
             settings.register_min_inliers,
             settings.register_min_ratio,
+            self.max_focals_px(),
             settings.seed,
             self.registered_late,
         )
@@ -317,6 +334,36 @@ class _Mapper:
         if done:
             self.complete(done)
         return bool(done)
+
+    def add_left_out(self) -> None:
+        """Register what is left out on the finished model, which stays as it is.
+
+        Lenses so long that their rays are parallel, and images that would bend the model, find a pose so.
+        """
+        settings = self.settings
+        if not left_out_images(self.reconstruction):
+            return
+        done = register_left_out(
+            self.reconstruction,
+            self.graph,
+            settings.thresholds_px[-1],
+            max(settings.register_min_inliers, settings.min_observations),
+            settings.register_min_ratio,
+            self.max_focals_px(),
+            settings.seed,
+        )
+        if done:
+            self.record("left-out images", (self.records[-1].costs[1],) * 2)
+
+    def max_focals_px(self) -> dict[int, float]:
+        """The longest plausible focal length of each camera, by id, whose own is guessed and free."""
+        if not self.solving.refine_focal:
+            return {}
+        return {
+            row + 1: self.settings.max_guessed_focal_change * usual_focal_px(camera)
+            for row, camera in enumerate(self.cameras)
+            if is_guessed(camera) and row + 1 not in self.solving.constant_cameras
+        }
 
 
 def keypoint_noise_px(reconstruction: pycolmap.Reconstruction) -> float:

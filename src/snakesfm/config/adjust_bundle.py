@@ -10,7 +10,7 @@ from snakesfm.config.base import StageOptions
 class AdjustBundleOptions(StageOptions):
     """How cameras, poses and points are adjusted together."""
 
-    stage_version: ClassVar[int] = 11
+    stage_version: ClassVar[int] = 12
 
     solver: Literal["ceres", "gtsam"] = "ceres"
     """Least-squares solver: Ceres through pycolmap, or gtsam (slower, fewer camera models)."""
@@ -91,7 +91,7 @@ class AdjustBundleOptions(StageOptions):
     """Correlation from which on a refined keypoint is taken; others stay where they were found."""
 
     register_images: bool = True
-    """Register images that averaging left out by their matches to points."""
+    """Register images that averaging or adjustment left out by their matches to points."""
 
     register_min_inliers: int = Field(default=15, ge=6)
     """Points that a newly registered image must agree with."""

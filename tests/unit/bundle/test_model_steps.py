@@ -184,7 +184,7 @@ def test_left_out_image_is_registered_and_a_stranger_is_not():
         rows = made.pairs[pair_of, side] == 7
         strange[rows, side] = rng.integers(0, len(made.keypoints[7]), rows.sum())
     graph = graph_of(made, strange)
-    assert register_left_out(reconstruction, graph, 6.0, 15, 0.25, 0) == [4]
+    assert register_left_out(reconstruction, graph, 6.0, 15, 0.25, {}, 0) == [4]
     pose = reconstruction.image(5).cam_from_world()
     assert np.degrees(angle_of(pose.rotation.matrix().T @ made.rotations[4])) < 0.3
     assert np.linalg.norm(pose.inverse().translation - made.centers[4]) < 0.05
