@@ -13,7 +13,6 @@ from benchmarks import ROOT
 from benchmarks.compare.measure import Cost, run_measured, run_operation
 from benchmarks.compare.sets import ImageSet
 from benchmarks.job_logs import DONE
-from snakesfm.artifacts import ImageIndex, TwoViewGeometries
 
 FEATURES = 5000
 EXTRACT = (
@@ -94,30 +93,8 @@ def _clock(text: str) -> float:
     return datetime.fromisoformat(text).timestamp()
 
 
-def write_pairs(scene: Path, path: Path, least_inliers: int) -> int:
-    """List the pairs of a finished snakesfm run with ``least_inliers`` or more; how many there are.
-
-    Raises
-    ------
-    ArtifactError : the run is not finished.
-    """
-    names = ImageIndex.read(scene / "index_images" / "index.h5").names
-    lines = []
-    for file in sorted((scene / "estimate_two_view").glob("*.h5")):
-        with TwoViewGeometries.open(file) as tile:
-            enough = tile["inlier_counts"][()] >= least_inliers
-            lines += [f"{names[i]} {names[j]}\n" for i, j in tile["pairs"][()][enough].tolist()]
-    path.write_text("".join(lines), "utf-8")
-    return len(lines)
-
-
-def colmap_front_end(
-    image_set: ImageSet, folder: Path, pairs: str, threads: int, limit_s: float
-) -> dict[str, Cost]:
-    """COLMAP's own features and matches in folder/database.db, made once; the cost of both stages.
-
-    ``pairs`` is a file that lists the pairs, or '' for all.
-    """
+def colmap_front_end(image_set: ImageSet, folder: Path, threads: int, limit_s: float) -> dict[str, Cost]:
+    """COLMAP's own features and matches of all pairs in folder/database.db, made once; the cost of both."""
     record = folder / "cost.json"
     if record.is_file():
         return {name: Cost(**cost) for name, cost in json.loads(record.read_text("utf-8")).items()}
@@ -131,7 +108,7 @@ def colmap_front_end(
         "features": FEATURES,
         "threads": threads,
     }
-    matching = {"database": database, "pairs": pairs, "threads": threads}
+    matching = {"database": database, "threads": threads}
     costs = {
         "extract": run_operation("extract", extraction, folder / "extract.log", limit_s),
         "match": run_operation("match", matching, folder / "match.log", limit_s),

@@ -39,16 +39,11 @@ def extract(images: str, database: str, cameras: list[dict[str, Any]], features:
         )
 
 
-def match(database: str, pairs: str, threads: int) -> None:
-    """Match and verify all pairs, or those that the file ``pairs`` lists."""
+def match(database: str, threads: int) -> None:
+    """Match and verify all pairs."""
     options = pycolmap.FeatureMatchingOptions()
     options.use_gpu, options.num_threads = False, threads
-    if pairs:
-        pairing = pycolmap.ImportedPairingOptions()
-        pairing.match_list_path = pairs
-        pycolmap.match_image_pairs(database, matching_options=options, pairing_options=pairing)
-    else:
-        pycolmap.match_exhaustive(database, matching_options=options)
+    pycolmap.match_exhaustive(database, matching_options=options)
 
 
 def map_incremental(database: str, images: str, output: str, fixed: bool, seed: int, threads: int) -> None:

@@ -34,7 +34,6 @@ class Result:
     metrics : the project's own evaluation of the model.
     stages : cost of extract, match, map and total; those that the setting has.
     inputs : digest of what the run started from; a result of other inputs is made again.
-    note : what a reader must know, such as a list of pairs.
     """
 
     image_set: str
@@ -46,7 +45,6 @@ class Result:
     seed: int
     inputs: str = ""
     failure: str = ""
-    note: str = ""
     date: str = ""
     metrics: dict[str, Any] = field(default_factory=dict)
     stages: dict[str, Cost] = field(default_factory=dict)

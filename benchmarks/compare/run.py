@@ -15,11 +15,9 @@ from benchmarks.compare import methods
 from benchmarks.compare.measure import CommandError, Cost
 from benchmarks.compare.results import GLOBAL, INCREMENTAL, OPENMVG, OURS, OWN, SAME, Result, evaluate
 from benchmarks.compare.sets import ImageSet
-from snakesfm.errors import SnakesfmError
 
 OPERATIONS = {INCREMENTAL: "map_incremental", GLOBAL: "map_global"}
 LARGE_SET = 60
-PAIR_INLIERS = 15  # what COLMAP asks of a pair
 SOURCES = ("Snakefile", "config.yaml", "scripts", "workflow/rules", "src/snakesfm")
 Costs = dict[str, Cost]
 
@@ -54,8 +52,7 @@ class Campaign:
     def run(self, image_set: ImageSet) -> None:
         """All methods on one set."""
         images = len(image_set.image_names())
-        large = images > LARGE_SET
-        seeds = range(self.large_seeds if large else self.seeds)
+        seeds = range(self.large_seeds if images > LARGE_SET else self.seeds)
         work = self.folder / "work" / image_set.name
         blank = Result(image_set.name, images, image_set.known, image_set.truth, "", "", 0)
         if OURS in self.chosen:
@@ -64,7 +61,7 @@ class Campaign:
         scene = work / "snakesfm-0" / "out" / image_set.name
         peers = [method for method in OPERATIONS if method in self.chosen]
         if peers:
-            self._run_own(image_set, work, scene, replace(blank, setting=OWN), peers, seeds, large)
+            self._run_own(image_set, work, replace(blank, setting=OWN), peers, seeds)
             self._run_same(image_set, work, scene, replace(blank, setting=SAME), peers, seeds)
         if OPENMVG in self.chosen:
             for seed in seeds:
@@ -89,39 +86,19 @@ class Campaign:
                 shutil.rmtree(scene / stage, ignore_errors=True)
 
     def _run_own(
-        self,
-        image_set: ImageSet,
-        work: Path,
-        scene: Path,
-        blank: Result,
-        peers: list[str],
-        seeds: range,
-        large: bool,
+        self, image_set: ImageSet, work: Path, blank: Result, peers: list[str], seeds: range
     ) -> None:
         """COLMAP's mappers after its own front-end, which they share."""
         front = work / "colmap"
-        pairs = work / "pairs.txt" if large else None
-        if pairs is not None:
-            try:
-                # kept when snakesfm changes, as the front-end is that was run with it
-                count = count_lines(pairs) or methods.write_pairs(scene, pairs, PAIR_INLIERS)
-            except SnakesfmError as error:
-                print(f"{image_set.name}: COLMAP's front-end has no list of pairs: {error}")
-                return
-            possible = blank.images * (blank.images - 1) // 2
-            note = f"{count} of {possible} pairs: those with at least {PAIR_INLIERS} inliers in snakesfm"
-            blank = replace(blank, note=note)
-        inputs = version("pycolmap") + blank.note
+        inputs = version("pycolmap")
         runs = [replace(blank, method=m, seed=s, inputs=inputs) for s in seeds for m in peers]
         if all(self._taken_over(result) for result in runs):
             return
         try:
-            costs = methods.colmap_front_end(image_set, front, str(pairs or ""), self.threads, self.limit_s)
+            costs = methods.colmap_front_end(image_set, front, self.threads, self.limit_s)
             if self.retime and not all(cost.undisturbed for cost in costs.values()):
                 (front / "cost.json").unlink()
-                costs = methods.colmap_front_end(
-                    image_set, front, str(pairs or ""), self.threads, self.limit_s
-                )
+                costs = methods.colmap_front_end(image_set, front, self.threads, self.limit_s)
         except CommandError as error:
             for result in runs:
                 _report(replace(result, failure=f"front-end {error}")).write(self.results)
@@ -205,11 +182,6 @@ def _report(result: Result) -> Result:
         text += "" if result.undisturbed else " (disturbed)"
     print(f"{result.image_set} {result.method} {result.setting} seed {result.seed}: {text}", flush=True)
     return result
-
-
-def count_lines(path: Path) -> int:
-    """Lines of a text file; 0 where there is none."""
-    return len(path.read_text("utf-8").splitlines()) if path.is_file() else 0
 
 
 def source_digest() -> str:

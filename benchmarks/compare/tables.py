@@ -22,7 +22,6 @@ from benchmarks.compare.results import (
     SETTINGS,
     Result,
 )
-from benchmarks.compare.run import LARGE_SET, PAIR_INLIERS
 from benchmarks.compare.summary import (
     ACCURACY,
     COLUMNS,
@@ -56,7 +55,7 @@ def render_csv(results: Sequence[Result]) -> str:
     stream = io.StringIO()
     fixed = ("image_set", "images", "known", "truth", "method", "setting", "seed", "date")
     writer = csv.writer(stream, lineterminator="\n")
-    writer.writerow([*fixed, *(column.key for column in COLUMNS), "undisturbed", "failure", "note"])
+    writer.writerow([*fixed, *(column.key for column in COLUMNS), "undisturbed", "failure"])
     for result in sorted(results, key=_order):
         values = [column.value(result) for column in COLUMNS]
         writer.writerow(
@@ -65,7 +64,6 @@ def render_csv(results: Sequence[Result]) -> str:
                 *("" if value is None else f"{value:.6g}" for value in values),
                 result.undisturbed,
                 result.failure,
-                result.note,
             ]
         )
     return stream.getvalue()
@@ -122,8 +120,6 @@ def render_page(results: Sequence[Result], machine: Mapping[str, str], command: 
         )
         lines += ["", f"## {name}", ""]
         lines.append(f"{result.images} images; intrinsics {given}; the reference is {kind}.")
-        notes = sorted({item.note for item in ordered if item.image_set == name and item.note})
-        lines += [f"COLMAP's own front-end matched {note}." for note in notes]
         for setting in SETTINGS:
             for columns in (ACCURACY, COSTS):
                 lines += _table(name, setting, columns, groups)
@@ -133,8 +129,7 @@ def render_page(results: Sequence[Result], machine: Mapping[str, str], command: 
 def _explanation() -> list[str]:
     return [
         f"**(a)** every method with its own front-end, {FEATURES} features an image (openMVG: its own number), all "
-        f"pairs; on sets above {LARGE_SET} images COLMAP is given only the pairs with at least {PAIR_INLIERS} inliers "
-        "in snakesfm, which spares it time. **(b)** COLMAP's mappers on the database that snakesfm exports "
+        "pairs. **(b)** COLMAP's mappers on the database that snakesfm exports "
         "(`export_database`): the same features, pairs and two-view geometries.",
         "",
         "`colmap_incremental` and `colmap_global` (GLOMAP) are pycolmap's `incremental_mapping` and `global_mapping` "
