@@ -18,6 +18,7 @@ from snakesfm.artifacts import (
     PairMatches,
     TrackTable,
     TwoViewGeometries,
+    ViewGraph,
 )
 from snakesfm.artifacts.gather import gather_inlier_matches
 from snakesfm.artifacts.hloc import read_hloc_matches
@@ -82,8 +83,9 @@ def test_hlocs_files_hold_the_inliers_and_give_them_back(
     assert outcome.status == 0, outcome.text
     folder = workflow.folder / "out" / "square" / "export_hloc"
     names = [str(name) for name in ImageIndex.read(finished[0] / "index_images" / "index.h5").names]
+    accepted = ViewGraph.read(finished[0] / "build_view_graph" / "graph.h5").pairs
     pairs, offsets, inliers = gather_inlier_matches(
-        sorted((finished[0] / "estimate_two_view").glob("*.h5"))
+        sorted((finished[0] / "estimate_two_view").glob("*.h5")), accepted
     )
     listed = [tuple(line.split()) for line in (folder / "pairs.txt").read_text().splitlines()]
     assert listed == [(names[i], names[j]) for i, j in pairs.tolist()] and len(listed) > 30

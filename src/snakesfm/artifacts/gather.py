@@ -42,27 +42,26 @@ def gather_image_columns(paths: Sequence[Path], count: int, *columns: str) -> li
     return gathered
 
 
-def gather_inlier_matches(paths: Sequence[Path], pairs: Array | None = None) -> tuple[Array, Array, Array]:
+def gather_inlier_matches(paths: Sequence[Path], pairs: Array) -> tuple[Array, Array, Array]:
     """Inlier matches of pairs of all tiles, sorted by pair.
 
     Parameters
     ----------
     paths : the TwoViewGeometries files of all tiles.
-    pairs : (E,2) the pairs that are wanted, refused ones too; None for all accepted ones.
+    pairs : (E,2) the pairs that are wanted, refused ones too.
 
     Returns
     -------
     pairs (P,2) int32, offsets (P+1,) int64 and matches (M,2) int32, keypoint rows in image i and j.
     """
-    wanted = None if pairs is None else {tuple(pair) for pair in pairs.tolist()}
+    wanted = {tuple(pair) for pair in pairs.tolist()}
     parts: list[tuple[tuple[int, int], Array]] = []
     for path in paths:
         with TwoViewGeometries.open(path) as file:
-            tile, rejections = file["pairs"][()], file["rejections"][()]
-            offsets, inliers = file["offsets"][()], file["inliers"][()]
-        for row in np.nonzero(rejections == 0 if wanted is None else np.diff(offsets) > 0)[0]:
+            tile, offsets, inliers = file["pairs"][()], file["offsets"][()], file["inliers"][()]
+        for row in np.nonzero(np.diff(offsets))[0]:
             pair = (int(tile[row, 0]), int(tile[row, 1]))
-            if wanted is None or pair in wanted:
+            if pair in wanted:
                 parts.append((pair, inliers[offsets[row] : offsets[row + 1]]))
     parts.sort(key=lambda part: part[0])
     rows = np.array([pair for pair, _ in parts], dtype=np.int32).reshape(-1, 2)
