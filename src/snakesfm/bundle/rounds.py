@@ -30,6 +30,8 @@ from snakesfm.geometry.camera import Camera
 Array = NDArray[Any]
 
 EARLY_TOLERANCE = 300.0
+# of the longest plausible focal length: the rays of such a lens are all but parallel
+LONG_LENS_SHARE = 0.5
 # early rounds come before all observations are there, final ones after, the last of which is exact
 Phase = Literal["early", "final", "last"]
 
@@ -154,6 +156,8 @@ def adjust_rounds(
     if settings.refine_principal_points and settings.solver == "ceres":
         mapper.refine_principal_points()
     mapper.drop_outliers()
+    if settings.register_images:
+        mapper.set_long_lenses_aside()
     mapper.round("last pass", settings.thresholds_px[-1], "last")
     if settings.register_images:
         mapper.add_left_out()
@@ -334,6 +338,16 @@ class _Mapper:
         if done:
             self.complete(done)
         return bool(done)
+
+    def set_long_lenses_aside(self) -> None:
+        """Take out single images of lenses so long that the last pass would not settle them."""
+        longest = self.max_focals_px()
+        long = [
+            camera_id
+            for camera_id, most in longest.items()
+            if self.reconstruction.camera(camera_id).mean_focal_length() > LONG_LENS_SHARE * most
+        ]
+        deregister_images_alone(self.reconstruction, long)
 
     def add_left_out(self) -> None:
         """Register what is left out on the finished model, which stays as it is.

@@ -10,7 +10,7 @@ from snakesfm.config.base import StageOptions
 class AdjustBundleOptions(StageOptions):
     """How cameras, poses and points are adjusted together."""
 
-    stage_version: ClassVar[int] = 12
+    stage_version: ClassVar[int] = 13
 
     solver: Literal["ceres", "gtsam"] = "ceres"
     """Least-squares solver: Ceres through pycolmap, or gtsam (slower, fewer camera models)."""
@@ -120,7 +120,7 @@ class AdjustBundleOptions(StageOptions):
     final_observations: int = Field(default=0, ge=0)
     """The same in the last round and later ones; 0 for all."""
 
-    max_iterations: int = Field(default=100, ge=1)
+    max_iterations: int = Field(default=50, ge=1)
     """Iterations of the solver per pass."""
 
     function_tolerance: float = Field(default=3e-6, gt=0.0)

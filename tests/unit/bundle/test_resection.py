@@ -99,13 +99,13 @@ def adjusted(made, model):
         RoundSettings(refine_principal_points=False),
         records.append,
     )
-    return from_reconstruction(reconstruction, model), [record.name for record in records]
+    return from_reconstruction(reconstruction, model), records
 
 
 def test_an_image_that_leaves_in_the_last_pass_is_added_to_the_finished_model(monkeypatch):
     made, model = own_cameras()
-    truly, names = adjusted(made, model)
-    assert names[-1] == "last pass"
+    truly, records = adjusted(made, model)
+    assert records[-1].name == "last pass"
     passes = []
 
     def wild_at_last(reconstruction, *_):
@@ -116,14 +116,24 @@ def test_an_image_that_leaves_in_the_last_pass_is_added_to_the_finished_model(mo
         return frozenset([7])
 
     monkeypatch.setattr(rounds, "reset_wild_cameras", wild_at_last)
-    found, names = adjusted(made, model)
-    assert names[-2:] == ["last pass", "left-out images"]
+    found, records = adjusted(made, model)
+    assert [record.name for record in records[-2:]] == ["last pass", "left-out images"]
     assert found.registered.all()
     assert abs(found.cameras[6].focal_px / truly.cameras[6].focal_px - 1) < 0.02
     turned = found.rotations[6] @ found.rotations[0].T @ made.rotations[0] @ made.rotations[6].T
     assert np.degrees(angle_of(turned)) < 0.5
     seen = [np.count_nonzero(result.image_ids == 6) for result in (found, truly)]
     assert 15 <= seen[0] <= seen[1]
+
+
+def test_a_long_lens_takes_no_part_in_the_last_pass():
+    made, model = own_cameras()
+    # what is long depends on the size of the image
+    cameras = tuple(replace(c, width=32, height=24) if k == 6 else c for k, c in enumerate(model.cameras))
+    found, records = adjusted(made, replace(model, cameras=cameras))
+    assert [record.name for record in records[-2:]] == ["last pass", "left-out images"]
+    assert [record.counts[0] for record in records[-3:]] == [12, 11, 12]
+    assert abs(found.cameras[6].focal_px / 500.0 - 1) < 0.02
 
 
 def test_only_images_that_share_their_camera_with_none_leave_with_it():
