@@ -13,7 +13,9 @@ from snakesfm.artifacts import (
     ViewGraph,
 )
 from snakesfm.bundle.completion import correspondence_graph
-from snakesfm.bundle.model import BundleModel
+from snakesfm.bundle.interface import SolverSettings
+from snakesfm.bundle.model import BundleModel, from_reconstruction, to_reconstruction
+from snakesfm.bundle.rounds import RoundSettings, adjust_rounds
 from snakesfm.geometry.camera import cameras_to_columns
 from snakesfm.view_graph.components import label_components
 
@@ -84,6 +86,21 @@ def graph_of(made, matches=None):
     counts = [len(points) for points in made.keypoints]
     matches = made.matches if matches is None else matches
     return correspondence_graph(counts, made.pairs, made.match_offsets, matches)
+
+
+def run_rounds(made, model, solving=None, **changes):
+    """The adjusted model, and the records of its rounds, with changed settings."""
+    reconstruction = to_reconstruction(model, made.keypoints, [f"{k}.jpg" for k in range(made.image_count)])
+    records = []
+    adjust_rounds(
+        reconstruction,
+        lambda: graph_of(made),
+        model.cameras,
+        solving or SolverSettings(),
+        RoundSettings(**changes),
+        records.append,
+    )
+    return from_reconstruction(reconstruction, model), records
 
 
 def side_by_side(first, second):

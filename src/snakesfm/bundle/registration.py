@@ -1,4 +1,4 @@
-"""Registration of images that averaging left out, by their matches to points of the model."""
+"""Registration of images that averaging or adjustment left out, by their matches to points of the model."""
 
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass

@@ -1,6 +1,6 @@
 """The chained rounds of bundle adjustment."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -225,11 +225,10 @@ class _Mapper:
             settings.max_guessed_focal_change,
             settings.max_distortion,
         )
-        if wild and phase == "last":
-            # no pass is left in which they could come back: their images are added to the finished model
-            wild = deregister_images_alone(self.reconstruction, wild)
-            costs = self.solve(replace(solving, constant_cameras=solving.constant_cameras | wild), phase)
-        elif wild:
+        if wild:
+            if phase == "last" and settings.register_images:
+                # no pass is left for them to come back in: their images are added to the finished model
+                wild = deregister_images_alone(self.reconstruction, wild)
             held = solving.constant_cameras | wild
             costs = self.solve(replace(solving, constant_cameras=held), phase)
         filter_observations(
@@ -322,17 +321,8 @@ class _Mapper:
         An image that the adjustment throws out again is not tried twice, or that would go on for ever.
         """
         settings = self.settings
-        if not left_out_images(self.reconstruction, self.registered_late):
-            return False
-        done = register_left_out(
-            self.reconstruction,
-            self.graph,
-            settings.register_error_px,
-            settings.register_min_inliers,
-            settings.register_min_ratio,
-            self.max_focals_px(),
-            settings.seed,
-            self.registered_late,
+        done = self.place_left_out(
+            settings.register_error_px, settings.register_min_inliers, self.registered_late
         )
         self.registered_late.update(done)
         if done:
@@ -355,19 +345,27 @@ class _Mapper:
         Lenses so long that their rays are parallel, and images that would bend the model, find a pose so.
         """
         settings = self.settings
-        if not left_out_images(self.reconstruction):
-            return
-        done = register_left_out(
+        least = max(settings.register_min_inliers, settings.min_observations)
+        if self.place_left_out(settings.thresholds_px[-1], least):
+            self.record("left-out images", (self.records[-1].costs[1],) * 2)
+
+    def place_left_out(
+        self, max_error_px: float, min_inliers: int, refused: Collection[int] = ()
+    ) -> list[int]:
+        """Give images without a pose one, but for the rows ``refused``; the rows of those that got one."""
+        # the matches are not read for nothing
+        if not left_out_images(self.reconstruction, refused):
+            return []
+        return register_left_out(
             self.reconstruction,
             self.graph,
-            settings.thresholds_px[-1],
-            max(settings.register_min_inliers, settings.min_observations),
-            settings.register_min_ratio,
+            max_error_px,
+            min_inliers,
+            self.settings.register_min_ratio,
             self.max_focals_px(),
-            settings.seed,
+            self.settings.seed,
+            refused,
         )
-        if done:
-            self.record("left-out images", (self.records[-1].costs[1],) * 2)
 
     def max_focals_px(self) -> dict[int, float]:
         """The longest plausible focal length of each camera, by id, whose own is guessed and free."""

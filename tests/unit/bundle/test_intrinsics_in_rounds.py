@@ -5,11 +5,10 @@ from dataclasses import replace
 import cv2  # noqa: F401
 import numpy as np
 import pytest
-from synthetic_scene import graph_of, true_model
+from synthetic_scene import run_rounds, true_model
 
 from snakesfm.bundle import rounds
 from snakesfm.bundle.interface import SolverSettings
-from snakesfm.bundle.model import from_reconstruction, to_reconstruction
 from snakesfm.geometry.camera import Camera
 from snakesfm.synthetic.problems import make_problem
 
@@ -35,16 +34,8 @@ def adjusted(solving=None, **changes):
     """The camera that the rounds find from a wrong focal length without distortion."""
     made = make_problem(12, 600, noise_px=0.2, camera=TRUE, seed=5)
     model = replace(true_model(made), cameras=(START,))
-    reconstruction = to_reconstruction(model, made.keypoints, [f"{k}.jpg" for k in range(12)])
-    rounds.adjust_rounds(
-        reconstruction,
-        lambda: graph_of(made),
-        model.cameras,
-        solving or SolverSettings(),
-        rounds.RoundSettings(thresholds_px=(20.0, 5.0, 3.0), **changes),
-        lambda record: None,
-    )
-    return np.array(from_reconstruction(reconstruction, model).cameras[0].params)
+    found, _ = run_rounds(made, model, solving, thresholds_px=(20.0, 5.0, 3.0), **changes)
+    return np.array(found.cameras[0].params)
 
 
 @pytest.mark.parametrize(("start", "rounds_with"), [(1, [1, 1, 1]), (2, [0, 1, 1]), (9, [0, 0, 1])])
@@ -93,8 +84,6 @@ def test_only_observations_within_the_noise_take_part_in_the_last_pass(monkeypat
     made = make_problem(12, 600, noise_px=0.05, camera=TRUE, seed=5)
     wrong = np.random.default_rng(0).choice(len(made.keypoints[3]), 40, replace=False)
     made.keypoints[3][wrong] += 2.0
-    model = true_model(made)
-    reconstruction = to_reconstruction(model, made.keypoints, [f"{k}.jpg" for k in range(12)])
     seen = []
     adjuster = rounds.bundle_adjuster("ceres")
 
@@ -104,12 +93,6 @@ def test_only_observations_within_the_noise_take_part_in_the_last_pass(monkeypat
         return adjuster(reconstruction, settings)
 
     monkeypatch.setattr(rounds, "bundle_adjuster", lambda solver: adjust)
-    rounds.adjust_rounds(
-        reconstruction,
-        lambda: graph_of(made),
-        model.cameras,
-        SolverSettings(),
-        rounds.RoundSettings(outlier_sigmas=sigmas, complete_tracks=False, refine_principal_points=False),
-        lambda record: None,
-    )
+    settings = {"outlier_sigmas": sigmas, "complete_tracks": False, "refine_principal_points": False}
+    run_rounds(made, true_model(made), **settings)
     assert len(seen) == 1 and fewest <= seen[0] <= most

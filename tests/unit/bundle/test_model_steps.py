@@ -6,7 +6,7 @@ import cv2  # noqa: F401
 import numpy as np
 import pycolmap
 import pytest
-from synthetic_scene import graph_of
+from synthetic_scene import graph_of, run_rounds
 
 from snakesfm.bundle.completion import TrackCompleter, drop_repeated_observations
 from snakesfm.bundle.filtering import (
@@ -18,7 +18,6 @@ from snakesfm.bundle.filtering import (
 from snakesfm.bundle.interface import SolverSettings
 from snakesfm.bundle.model import BundleModel, from_reconstruction, reprojection_errors, to_reconstruction
 from snakesfm.bundle.registration import register_left_out
-from snakesfm.bundle.rounds import RoundSettings, adjust_rounds
 from snakesfm.geometry.camera import Camera
 from snakesfm.geometry.poses import translation_of
 from snakesfm.geometry.rotations import angle_of
@@ -206,23 +205,14 @@ def perturbed(made, left_out=()):
     )
 
 
-def run_rounds(made, model, **changes):
-    reconstruction = to_reconstruction(model, made.keypoints, NAMES)
-    records = []
-    adjust_rounds(
-        reconstruction,
-        lambda: graph_of(made),
-        model.cameras,
-        SolverSettings(constant_cameras=frozenset([1])),
-        RoundSettings(**changes),
-        records.append,
-    )
-    return from_reconstruction(reconstruction, model), records
+def adjusted(made, model, **changes):
+    """As :func:`run_rounds`, with the intrinsics held."""
+    return run_rounds(made, model, SolverSettings(constant_cameras=frozenset([1])), **changes)
 
 
 def test_rounds_are_chained_and_recover_the_truth():
     made = problem(outlier_ratio=0.05)
-    result, records = run_rounds(made, perturbed(made), rotations_first=True)
+    result, records = adjusted(made, perturbed(made), rotations_first=True)
     names = [record.name for record in records]
     assert names == ["rotations fixed", "round 1", "round 2", "round 3", "last pass"]
     assert records[0].costs[0] > 5 * records[1].costs[1]
@@ -244,11 +234,11 @@ def test_rounds_are_chained_and_recover_the_truth():
 
 def test_left_out_images_get_a_last_round():
     made = problem()
-    result, records = run_rounds(made, perturbed(made, left_out=[6]))
+    result, records = adjusted(made, perturbed(made, left_out=[6]))
     assert [record.name for record in records[-2:]] == ["registration", "last pass"]
     assert records[-1].counts[0] == 12
     assert np.isfinite(result.rotations).all()
-    stays, _ = run_rounds(made, perturbed(made, left_out=[6]), register_images=False)
+    stays, _ = adjusted(made, perturbed(made, left_out=[6]), register_images=False)
     assert np.isnan(stays.rotations[6]).all()
 
 
@@ -260,13 +250,13 @@ def test_an_image_that_is_thrown_out_again_is_registered_once():
     counts = np.bincount(pair_of[few], minlength=len(made.pairs))
     made = replace(made, matches=made.matches[few], match_offsets=np.r_[0, np.cumsum(counts)])
     limits = {"register_min_inliers": 6, "min_observations": SEEN}
-    result, records = run_rounds(made, perturbed(made, left_out=[6]), **limits)
+    result, records = adjusted(made, perturbed(made, left_out=[6]), **limits)
     assert [record.name for record in records].count("registration") == 1
     assert np.isnan(result.rotations[6]).all() and 10 <= records[-1].counts[0] <= 11
 
 
 def test_rounds_are_deterministic():
     made = problem(outlier_ratio=0.03)
-    first, second = (run_rounds(made, perturbed(made))[0] for _ in range(2))
+    first, second = (adjusted(made, perturbed(made))[0] for _ in range(2))
     np.testing.assert_array_equal(first.points, second.points)
     np.testing.assert_array_equal(first.image_ids, second.image_ids)

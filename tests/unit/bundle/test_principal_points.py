@@ -5,11 +5,9 @@ from dataclasses import replace
 import cv2  # noqa: F401
 import numpy as np
 import pytest
-from synthetic_scene import graph_of, true_model
+from synthetic_scene import run_rounds, true_model
 
 from snakesfm.bundle.interface import SolverSettings
-from snakesfm.bundle.model import from_reconstruction, to_reconstruction
-from snakesfm.bundle.rounds import RoundSettings, adjust_rounds
 from snakesfm.geometry.camera import Camera
 from snakesfm.synthetic.problems import make_problem
 
@@ -23,19 +21,8 @@ def refined(camera, noise_px=0.1, points=1000, per_image=False, held=frozenset()
     made = make_problem(12, points, noise_px=noise_px, camera=camera, seed=5)
     cameras = 12 if per_image else 1
     model = replace(true_model(made), cameras=(CENTRED,) * cameras, camera_ids=np.arange(12) % cameras)
-    reconstruction = to_reconstruction(model, made.keypoints, [f"{k}.jpg" for k in range(12)])
-    records = []
-    solving = SolverSettings(constant_cameras=held)
-    adjust_rounds(
-        reconstruction,
-        lambda: graph_of(made),
-        model.cameras,
-        solving,
-        RoundSettings(**changes),
-        records.append,
-    )
-    found = from_reconstruction(reconstruction, model).cameras
-    return np.array([camera.params for camera in found]), [record.name for record in records]
+    found, records = run_rounds(made, model, SolverSettings(constant_cameras=held), **changes)
+    return np.array([camera.params for camera in found.cameras]), [record.name for record in records]
 
 
 def test_a_well_told_principal_point_is_found():

@@ -6,14 +6,12 @@ import cv2  # noqa: F401
 import numpy as np
 import pycolmap
 import pytest
-from synthetic_scene import graph_of
+from synthetic_scene import run_rounds, true_model
 
 from snakesfm.bundle import rounds
 from snakesfm.bundle.filtering import deregister_images_alone
-from snakesfm.bundle.interface import SolverSettings
-from snakesfm.bundle.model import BundleModel, from_reconstruction, to_reconstruction
+from snakesfm.bundle.model import to_reconstruction
 from snakesfm.bundle.resection import resect
-from snakesfm.bundle.rounds import RoundSettings, adjust_rounds
 from snakesfm.geometry.camera import Camera
 from snakesfm.geometry.rotations import angle_of
 from snakesfm.synthetic.problems import make_problem
@@ -76,30 +74,11 @@ def own_cameras():
     cameras = tuple(
         Camera("SIMPLE_RADIAL", 640, 480, (500.0, 320.0, 240.0, 0.0), "estimated") for _ in range(12)
     )
-    return made, BundleModel(
-        cameras,
-        np.arange(12),
-        made.rotations,
-        made.translations,
-        made.points,
-        made.track_offsets,
-        made.track_image_ids,
-        made.track_keypoint_ids,
-    )
+    return made, replace(true_model(made), cameras=cameras, camera_ids=np.arange(12))
 
 
 def adjusted(made, model):
-    reconstruction = to_reconstruction(model, made.keypoints, NAMES)
-    records = []
-    adjust_rounds(
-        reconstruction,
-        lambda: graph_of(made),
-        model.cameras,
-        SolverSettings(),
-        RoundSettings(refine_principal_points=False),
-        records.append,
-    )
-    return from_reconstruction(reconstruction, model), records
+    return run_rounds(made, model, refine_principal_points=False)
 
 
 def test_an_image_that_leaves_in_the_last_pass_is_added_to_the_finished_model(monkeypatch):
