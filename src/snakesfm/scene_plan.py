@@ -138,7 +138,8 @@ class ScenePlan:
     def select_pairs(self) -> SelectPairsOptions:
         """How pairs are chosen, with 'auto' resolved."""
         options: SelectPairsOptions = self.configuration.select_pairs
-        return options.resolve(self.image_count, self.pairs_file)
+        detector = "" if self.detector_free else self.method("extract_features")
+        return options.resolve(self.image_count, self.pairs_file, detector)
 
     @property
     def pairs_file(self) -> str:
@@ -247,6 +248,10 @@ class ScenePlan:
         """The global descriptors of all blocks where pairs are retrieved, else nothing."""
         return self.files("describe_images", "blocks") if self.select_pairs.needs_descriptors else []
 
+    def previewed_features(self) -> list[str]:
+        """The features of all blocks where pairs are looked at before they are chosen, else nothing."""
+        return self.files("extract_features", "blocks") if self.select_pairs.looks_at_pairs else []
+
     @property
     def describes_pictures(self) -> bool:
         """Whether a network describes the images themselves, instead of their local descriptors."""
@@ -256,9 +261,17 @@ class ScenePlan:
         """The codebook of local descriptors where they describe the images, else nothing."""
         return [] if self.describes_pictures else [str(self.folder / "learn_vocabulary" / "vocabulary.h5")]
 
-    @functools.cached_property
+    @property
     def pair_count(self) -> int:
         """Most pairs that will be chosen, as far as is known before anything runs."""
+        enough = self.select_pairs.enough_partners
+        if not (self.select_pairs.looks_at_pairs and enough):
+            return self.proposed_pair_count
+        return min(self.image_count * enough, self.proposed_pair_count)
+
+    @functools.cached_property
+    def proposed_pair_count(self) -> int:
+        """Most pairs that the method proposes."""
         options, images = self.select_pairs, self.image_count
         everything = images * (images - 1) // 2
         if options.method == "exhaustive":
@@ -277,7 +290,8 @@ class ScenePlan:
         # a CUDA device holds its batches in memory of its own
         wanted = 1 if self.configuration.device == "cuda" else self.configuration.batch_size
         batch = 1 if wanted == "auto" else wanted
-        return job_load(stage, self.image_count, self.blocks, self.pair_count, networks, batch)
+        pairs = self.proposed_pair_count if stage == "select_pairs" else self.pair_count
+        return job_load(stage, self.image_count, self.blocks, pairs, networks, batch)
 
     def final_files(self) -> list[str]:
         """What a person looks at: the scene's model, its metrics and its report."""

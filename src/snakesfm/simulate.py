@@ -222,6 +222,7 @@ class Simulation:
             pairs=pairs,
             reasons=np.full(len(pairs), "listed", dtype=object),
             similarities=np.full(len(pairs), np.nan, np.float32),
+            likenesses=np.full(len(pairs), np.nan, np.float32),
         ).write(self._path("select_pairs", tile), self._header("select_pairs"))
 
     def write_pair_list(self, pairs: Array) -> None:

@@ -71,7 +71,7 @@ def test_every_column_says_shape_type_and_meaning(cls: type[Artifact]) -> None:
 
 
 def test_header_is_in_the_root_attributes(tmp_path: Path) -> None:
-    ImagePairs(pairs=[], reasons=[], similarities=[]).write(tmp_path / "a.h5", HEADER)
+    ImagePairs(pairs=[], reasons=[], similarities=[], likenesses=[]).write(tmp_path / "a.h5", HEADER)
     with h5py.File(tmp_path / "a.h5") as file:
         assert file.attrs["artifact"] == "image_pairs"
         assert file.attrs["stage"] == "match_pairs"
@@ -82,20 +82,20 @@ def test_header_is_in_the_root_attributes(tmp_path: Path) -> None:
 
 def test_lengths_that_disagree_are_refused() -> None:
     with pytest.raises(ValueError, match="reasons"):
-        ImagePairs(pairs=[[0, 1]], reasons=[], similarities=[0.0])
+        ImagePairs(pairs=[[0, 1]], reasons=[], similarities=[0.0], likenesses=[0.0])
     with pytest.raises(ValueError, match="offsets"):
         PairMatches(pairs=[[0, 1]], digests=["x"], offsets=[0], matches=[], scores=[])
 
 
 def test_a_dtype_that_would_lose_information_is_refused() -> None:
     with pytest.raises(ValueError, match="pairs"):
-        ImagePairs(pairs=[[0.5, 1.5]], reasons=["x"], similarities=[0.0])
+        ImagePairs(pairs=[[0.5, 1.5]], reasons=["x"], similarities=[0.0], likenesses=[0.0])
 
 
 @pytest.mark.parametrize("keep", [0, 10, 700])
 def test_a_truncated_file_gives_one_sentence(tmp_path: Path, keep: int) -> None:
     path = tmp_path / "a.h5"
-    ImagePairs(pairs=[[0, 1]], reasons=["x"], similarities=[0.5]).write(path, HEADER)
+    ImagePairs(pairs=[[0, 1]], reasons=["x"], similarities=[0.5], likenesses=[0.5]).write(path, HEADER)
     path.write_bytes(path.read_bytes()[:keep])
     with pytest.raises(ArtifactError, match="damaged") as caught:
         ImagePairs.read(path)
@@ -106,7 +106,7 @@ def test_another_kind_another_version_and_no_file_give_one_sentence(tmp_path: Pa
     path = tmp_path / "a.h5"
     with pytest.raises(ArtifactError, match="missing"):
         ImagePairs.read(path)
-    ImagePairs(pairs=[], reasons=[], similarities=[]).write(path, HEADER)
+    ImagePairs(pairs=[], reasons=[], similarities=[], likenesses=[]).write(path, HEADER)
     with pytest.raises(ArtifactError, match="view_graph"):
         ViewGraph.read(path)
     with h5py.File(path, "a") as file:
@@ -134,7 +134,7 @@ def test_what_a_killed_writer_left_is_removed_and_a_living_one_is_left_alone(tmp
     elsewhere = tmp_path / f".a.h5.other-host.{child.pid}.x.tmp"
     for leftover in (dead, living, elsewhere):
         leftover.write_text("half")
-    ImagePairs(pairs=[], reasons=[], similarities=[]).write(path, HEADER)
+    ImagePairs(pairs=[], reasons=[], similarities=[], likenesses=[]).write(path, HEADER)
     assert sorted(tmp_path.iterdir()) == sorted([living, elsewhere, path])
 
 
@@ -147,7 +147,9 @@ def test_what_a_killed_writer_left_is_removed_and_a_living_one_is_left_alone(tmp
 def test_any_text_survives(tmp_path_factory: pytest.TempPathFactory, texts: list[str]) -> None:
     path = tmp_path_factory.mktemp("text") / "a.h5"
     pairs = np.zeros((len(texts), 2), dtype=np.int32)
-    ImagePairs(pairs=pairs, reasons=texts, similarities=np.zeros(len(texts))).write(path, HEADER)
+    ImagePairs(
+        pairs=pairs, reasons=texts, similarities=np.zeros(len(texts)), likenesses=np.zeros(len(texts))
+    ).write(path, HEADER)
     assert list(ImagePairs.read(path).reasons) == texts
 
 

@@ -24,7 +24,10 @@ def write_pairs(
     settings: str = "",
 ) -> Path:
     pairs = ImagePairs(
-        pairs=np.array([[0, 1]]), reasons=np.array(["listed"], object), similarities=np.array([0.5])
+        pairs=np.array([[0, 1]]),
+        reasons=np.array(["listed"], object),
+        similarities=np.array([0.5]),
+        likenesses=np.array([2.0]),
     )
     pairs.write(path, Header(stage, version, scene, options, settings))
     return path

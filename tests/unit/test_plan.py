@@ -59,14 +59,20 @@ def test_seeds_differ_by_what_they_are_for_and_fit_31_bits() -> None:
 
 def test_small_scenes_are_exhaustive_and_large_ones_retrieve(tmp_path: Path) -> None:
     make_images(tmp_path / "small", 5)
-    make_images(tmp_path / "large", 501)
+    make_images(tmp_path / "large", 1001)
     small = plan_of(tmp_path, images=str(tmp_path / "small")).scenes["small"]
     large = plan_of(tmp_path, images=str(tmp_path / "large")).scenes["large"]
     assert small.select_pairs.method == "exhaustive"
     assert small.global_descriptors() == []
     assert not [file for file in small.all_files() if "describe_images" in file]
     assert large.select_pairs.method == "sequential+retrieval"
-    assert len(large.global_descriptors()) == large.blocks == 4
+    assert len(large.global_descriptors()) == large.blocks == 8
+    for scene in (small, large):
+        assert scene.previewed_features() == scene.files("extract_features", "blocks")
+    assert (large.pair_count, large.proposed_pair_count) == (30 * 1001, 110 * 1001)
+    assert small.pair_count == small.proposed_pair_count == 10
+    listed = plan_of(tmp_path, images=str(tmp_path / "small"), front_end="aliked+lightglue")
+    assert listed.scenes["small"].previewed_features() == []
 
 
 def test_params_are_canonical_and_follow_content_not_time(tmp_path: Path) -> None:

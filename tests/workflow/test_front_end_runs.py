@@ -278,7 +278,10 @@ def test_images_are_described_by_networks_with_random_weights(
         write_netvlad(path)
     else:
         torch.save(megaloc_state(), path)
-    config = ["select_pairs={method: retrieval, top_k: 2}", f"describe_images={{method: {method}}}"]
+    config = [
+        "select_pairs={method: retrieval, top_k: 2, preview_keypoints: 0}",
+        f"describe_images={{method: {method}}}",
+    ]
     config += [f"images={small_scene / 'images'}", "output=out"]
     outcome = workflow.run("--until", "select_pairs", "--config", *config)
     assert outcome.status == 0, outcome.text

@@ -120,6 +120,11 @@ def global_descriptors(wildcards):
     return PLAN.scenes[wildcards.scene].global_descriptors()
 
 
+def previewed_features(wildcards):
+    """The features of all blocks where pairs are looked at before they are chosen, else nothing."""
+    return PLAN.scenes[wildcards.scene].previewed_features()
+
+
 def described_features(wildcards):
     """A block's local features where these describe its images, else nothing."""
     scene = PLAN.scenes[wildcards.scene]

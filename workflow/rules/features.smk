@@ -71,6 +71,7 @@ for blocks, scenes in PLAN.scenes_by_blocks().items():
         input:
             index=artifact("index_images", "index.h5"),
             descriptors=global_descriptors,
+            features=previewed_features,
         output:
             [artifact("select_pairs", f"{tile}.h5") for tile in tile_names(blocks)],
         log:
@@ -79,7 +80,7 @@ for blocks, scenes in PLAN.scenes_by_blocks().items():
             benchmark_file("select_pairs")
         wildcard_constraints:
             scene=any_of(scenes),
-        # blocks of the similarity matrix are computed side by side
+        # blocks of the similarity matrix are computed side by side, and pairs looked at
         threads: 2
         resources:
             mem_mb=memory_mb("select_pairs"),

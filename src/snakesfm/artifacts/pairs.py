@@ -34,8 +34,11 @@ class ImagePairs(Artifact):
     kind: ClassVar[str] = "image_pairs"
 
     pairs: Array = column("(P,2)", "int32", "rows (i, j) of the index, i < j, sorted")
-    reasons: Array = column("(P)", "str", "why: exhaustive, sequential, retrieved, listed; joined by +")
+    reasons: Array = column(
+        "(P)", "str", "why: exhaustive, sequential, retrieved, listed, spatial; joined by +"
+    )
     similarities: Array = column("(P)", "float32", "global similarity, NaN where not computed")
+    likenesses: Array = column("(P)", "float32", "of the largest keypoints, NaN where not looked at")
 
 
 @dataclass(frozen=True)

@@ -36,12 +36,6 @@ class MatchPairsOptions(StageOptions):
     probes: float = Field(3.0, ge=1.0, le=256.0)
     """Words that a descriptor is compared with, on average over an image; more find more of the matches."""
 
-    preview_keypoints: int = Field(400, ge=0, le=10_000)
-    """Largest keypoints that are compared first, to leave pairs that share nothing (0: match all pairs)."""
-
-    min_likeness: float = Field(1.5, ge=0.0)
-    """Least resemblance of these keypoints in a pair that is matched; higher leaves more pairs out."""
-
     min_score: Annotated[float, Field(ge=0.0, le=1.0)] | Literal["auto"] = "auto"
     """Least confidence of a match that a network makes; 'auto' is 0.1, and 0.2 without keypoints."""
 

@@ -1,18 +1,21 @@
 """Options of select_pairs."""
 
-from typing import ClassVar, Literal, Self
+from typing import Annotated, ClassVar, Literal, Self
 
 from pydantic import Field
 
 from snakesfm.config.base import StageOptions
 
 MANY_IMAGES = 500
+# a look at a pair takes half a millisecond, matching it fifteen
+MANY_IMAGES_TO_LOOK_AT = 1_000
+SHORTLIST = 100
 
 
 class SelectPairsOptions(StageOptions):
     """Which pairs of images are matched."""
 
-    stage_version: ClassVar[int] = 1
+    stage_version: ClassVar[int] = 2
 
     method: Literal[
         "auto",
@@ -26,36 +29,56 @@ class SelectPairsOptions(StageOptions):
     ] = "auto"
     """All pairs, neighbours by name, similar images, neighbours by GPS, or a list's; 'auto' decides."""
 
-    exhaustive_up_to: int = Field(500, ge=2, le=100_000)
-    """Number of images up to which 'auto' takes all pairs, and sequential+retrieval beyond."""
+    exhaustive_up_to: Annotated[int, Field(ge=2, le=100_000)] | Literal["auto"] = "auto"
+    """Images up to which 'auto' takes all pairs: itself 1000 where pairs are looked at, else 500."""
 
     look_ahead: int = Field(10, ge=1, le=10_000)
     """How many following images, in the natural order of names, an image is paired with by 'sequential'."""
 
     top_k: int | Literal["auto"] = "auto"
-    """How many similar or near images an image is paired with; 'auto' is 15, and 30 from 500 images on."""
+    """Similar or near images that are proposed; 'auto' is 100 to look at, else 15, 30 from 500 images."""
 
     min_score: float = Field(0.0, ge=-1.0, le=1.0)
     """Least similarity of a pair chosen by 'retrieval'."""
 
-    def resolve(self, image_count: int, pairs_file: str = "") -> Self:
+    preview_keypoints: int = Field(400, ge=0, le=10_000)
+    """Largest SIFT keypoints by which proposed pairs are looked at before they are matched (0: no look)."""
+
+    min_likeness: float = Field(1.5, ge=0.0)
+    """Least resemblance of these keypoints in a pair that is matched; higher leaves more pairs out."""
+
+    enough_partners: int = Field(30, ge=0, le=10_000)
+    """How many of them an image keeps: half the most alike, half every second of the next (0: all)."""
+
+    enough_likeness: float = Field(250.0, ge=0.0)
+    """Images keep more than enough partners until their resemblance sums to this."""
+
+    def resolve(self, image_count: int, pairs_file: str = "", detector: str = "sift") -> Self:
         """The options with every 'auto' replaced by what it means for a number of images.
 
         Parameters
         ----------
         image_count : number of images of the scene.
         pairs_file : path of the user's list of pairs, or "" for none; 'auto' follows a list that is given.
+        detector : whose keypoints there are before pairs are chosen, or "" for none. Only SIFT's are looked
+            at: others have no scales, and what their descriptors resemble was never measured.
         """
+        look = self.preview_keypoints > 0 and detector == "sift"
+        most = self.exhaustive_up_to
+        if most == "auto":
+            most = MANY_IMAGES_TO_LOOK_AT if look else MANY_IMAGES
         method = self.method
         if method == "auto":
             if pairs_file:
                 method = "listed"
             else:
-                method = "exhaustive" if image_count <= self.exhaustive_up_to else "sequential+retrieval"
+                method = "exhaustive" if image_count <= most else "sequential+retrieval"
+        look = look and method not in ("sequential", "listed")
         top_k = self.top_k
         if top_k == "auto":
-            top_k = 30 if image_count >= MANY_IMAGES else 15
-        return self.model_copy(update={"method": method, "top_k": top_k})
+            top_k = SHORTLIST if look else 30 if image_count >= MANY_IMAGES else 15
+        shown = {"preview_keypoints": self.preview_keypoints if look else 0}
+        return self.model_copy(update={"method": method, "exhaustive_up_to": most, "top_k": top_k} | shown)
 
     @property
     def needs_descriptors(self) -> bool:
@@ -68,3 +91,8 @@ class SelectPairsOptions(StageOptions):
         if self.method == "auto":
             raise ValueError("resolve the options before asking what they need")
         return "retrieval" in self.method
+
+    @property
+    def looks_at_pairs(self) -> bool:
+        """Whether keypoints are looked at before pairs are chosen, once the options are resolved."""
+        return self.preview_keypoints > 0

@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 from snakesfm.features.keypoints import KeypointSet
 from snakesfm.matching.clustered import ClusteredSearch
 from snakesfm.matching.identity import IdentityMatcher
-from snakesfm.matching.nearest import ExactSearch, no_matches
-from snakesfm.matching.preview import largest_keypoints, likeness
+from snakesfm.matching.nearest import ExactSearch
 
 Array = NDArray[Any]
 
@@ -44,20 +43,6 @@ class BatchMatcher(Protocol):
 
 
 @dataclass(frozen=True)
-class PreparedImage:
-    """What :class:`MutualRatioMatcher` keeps of an image.
-
-    Parameters
-    ----------
-    target : where the first image's nearest descriptors are looked for, or the second image's descriptors.
-    preview : descriptors of the largest keypoints, or None where there is no preview.
-    """
-
-    target: Any
-    preview: Array | None
-
-
-@dataclass(frozen=True)
 class MutualRatioMatcher:
     """Mutual nearest neighbours with the ratio test on the descriptors alone.
 
@@ -66,40 +51,26 @@ class MutualRatioMatcher:
     max_ratio : as in :func:`snakesfm.matching.nearest.accept`.
     search : compare all descriptors, or those of like words.
     words, probes : as in :meth:`snakesfm.matching.clustered.ClusteredSearch.build`.
-    preview_keypoints : how many keypoints are looked at first; 0 for no preview.
-    min_likeness : least :func:`snakesfm.matching.preview.likeness` of images that are matched at all.
     """
 
     max_ratio: float = 0.8
     search: Literal["clustered", "exact"] = "clustered"
     words: int = 32
     probes: float = 3.0
-    preview_keypoints: int = 400
-    min_likeness: float = 1.5
 
-    def prepare(self, first: KeypointSet) -> PreparedImage:
+    def prepare(self, first: KeypointSet) -> ClusteredSearch | ExactSearch:
         """See :class:`Matcher`."""
-        search: ClusteredSearch | ExactSearch
         if self.search == "exact":
-            search = ExactSearch.build(first.descriptors)
-        else:
-            search = ClusteredSearch.build(first.descriptors, self.words, self.probes)
-        return PreparedImage(search, largest_keypoints(first, self.preview_keypoints))
+            return ExactSearch.build(first.descriptors)
+        return ClusteredSearch.build(first.descriptors, self.words, self.probes)
 
-    def prepare_second(self, second: KeypointSet) -> PreparedImage:
+    def prepare_second(self, second: KeypointSet) -> Array:
         """See :class:`Matcher`."""
-        return PreparedImage(second.descriptors, largest_keypoints(second, self.preview_keypoints))
+        return second.descriptors
 
-    def match(self, first: PreparedImage, second: PreparedImage) -> tuple[Array, Array]:
+    def match(self, first: ClusteredSearch | ExactSearch, second: Array) -> tuple[Array, Array]:
         """See :class:`Matcher`."""
-        if (
-            first.preview is not None
-            and second.preview is not None
-            and likeness(first.preview, second.preview) < self.min_likeness
-        ):
-            return no_matches()
-        matches: tuple[Array, Array] = first.target.match(second.target, self.max_ratio)
-        return matches
+        return first.match(second, self.max_ratio)
 
 
 def _learned(module: str, name: str) -> Callable[..., Matcher]:

@@ -100,11 +100,8 @@ def _create_matcher(job: StageJob, options: "MatchPairsOptions") -> Matcher:
         return create_matcher("virtual")
     detector = str(job.settings.get("detector", "sift"))
     if options.method == "mutual_ratio":
-        names = {"max_ratio", "search", "words", "probes", "preview_keypoints", "min_likeness"}
-        chosen = options.model_dump(include=names)
-        # other keypoints have no scales, and what their descriptors resemble was never measured
-        previewed = {} if detector == "sift" else {"preview_keypoints": 0}
-        return create_matcher("mutual_ratio", **chosen | previewed)
+        names = {"max_ratio", "search", "words", "probes"}
+        return create_matcher("mutual_ratio", **options.model_dump(include=names))
     return create_matcher(
         options.method,
         detector=detector,

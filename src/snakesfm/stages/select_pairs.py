@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from snakesfm.artifacts.features import GlobalDescriptors
+from snakesfm.artifacts.features import GlobalDescriptors, LocalFeatures
 from snakesfm.artifacts.images import ImageIndex
 from snakesfm.artifacts.pairs import ImagePairs
 from snakesfm.errors import ConfigError
@@ -20,6 +20,7 @@ from snakesfm.retrieval.pairs import (
     similar_pairs,
     spatial_pairs,
 )
+from snakesfm.retrieval.preview import choose_partners, largest_keypoints, look_at_pairs
 from snakesfm.stages.job import StageJob
 
 if TYPE_CHECKING:
@@ -27,16 +28,25 @@ if TYPE_CHECKING:
 
 Array = NDArray[Any]
 
+# how many pairs are looked at between two signs of progress: a second's work
+LOOKS_AT_ONCE = 2_000
+
 
 def run(job: StageJob) -> None:
     """Choose pairs by the method, which is no longer 'auto', and write one ImagePairs per tile.
 
-    A tile without pairs gets an empty one.
+    Where there are SIFT features, the method's pairs are looked at first, and each image keeps so many. A
+    tile without pairs gets an empty one.
     """
     index = ImageIndex.read(job.path("index"))
     pairs_file = str(job.settings["pairs_file"])
     options: SelectPairsOptions = job.options
     table = _choose(job, index, options, pairs_file)
+    proposed = len(table.pairs)
+    likenesses = np.full(proposed, np.nan, np.float32)
+    if options.preview_keypoints:
+        likenesses, stays = _look(job, table, len(index.names), options)
+        table, likenesses = table.take(stays), likenesses[stays]
     blocks = int(job.settings["blocks"])
     tiles = np.sort(index.blocks[table.pairs].astype(np.int64), axis=1) @ [blocks, 1]
     order = np.argsort(tiles, kind="stable")
@@ -49,8 +59,41 @@ def run(job: StageJob) -> None:
             pairs=part.pairs,
             reasons=np.array(part.reason_texts(), dtype=object),
             similarities=part.similarities,
+            likenesses=likenesses[order[first:last]],
         ).write(job.output.with_name(f"{tile[0]}-{tile[1]}.h5"), job.header)
-    print(f"{len(table.pairs)} pairs of {len(index.names)} images ({options.method})")
+    print(f"{len(table.pairs)} of {proposed} pairs of {len(index.names)} images ({options.method})")
+
+
+def _look(
+    job: StageJob, table: PairTable, images: int, options: "SelectPairsOptions"
+) -> tuple[Array, Array]:
+    """The likeness (P,) of pairs, NaN where an image has too few keypoints, and which stay (P,) bool."""
+    previews = _read_previews(job.paths("features"), images, options.preview_keypoints)
+    likenesses = np.full(len(table.pairs), np.nan, np.float32)
+    progress = job.progress(len(likenesses), "pairs looked at")
+    for start in range(0, len(likenesses), LOOKS_AT_ONCE):
+        part = slice(start, start + LOOKS_AT_ONCE)
+        likenesses[part] = look_at_pairs(table.pairs[part], previews, job.threads)
+        progress.step(len(likenesses[part]))
+    stays = ~(likenesses < options.min_likeness)
+    if options.enough_partners:
+        rows, enough = np.flatnonzero(stays), (options.enough_partners, options.enough_likeness)
+        stays[rows] = choose_partners(table.pairs[rows], likenesses[rows], *enough)
+    return likenesses, stays
+
+
+def _read_previews(paths: list[Path], images: int, count: int) -> list[Array | None]:
+    """Descriptors (count,D) of the largest keypoints of every image of the index, None where too few."""
+    previews: list[Array | None] = [None] * images
+    for path in paths:
+        with LocalFeatures.open(path) as file:
+            scales, descriptors = file["scales"][()], file["descriptors"]
+            offsets = file["offsets"][()].tolist()
+            for row, image in enumerate(file["image_ids"][()].tolist()):
+                part = slice(offsets[row], offsets[row + 1])
+                largest = largest_keypoints(scales[part], count)
+                previews[image] = None if largest is None else descriptors[part][largest]
+    return previews
 
 
 def _choose(job: StageJob, index: ImageIndex, options: "SelectPairsOptions", pairs_file: str) -> PairTable:

@@ -139,15 +139,33 @@ def test_a_wrong_line_is_named(line, words):
 
 def test_auto_is_resolved_by_the_number_of_images():
     options = SelectPairsOptions()
-    most = options.exhaustive_up_to
+    most = options.resolve(2).exhaustive_up_to
     assert options.resolve(most).method == "exhaustive"
     assert options.resolve(most + 1).method == "sequential+retrieval"
     assert options.resolve(most, "pairs.txt").method == "listed"
-    assert (options.resolve(499).top_k, options.resolve(500).top_k) == (15, 30)
+    assert options.resolve(most).top_k == 100 and options.resolve(most).looks_at_pairs
     assert not options.resolve(2).needs_descriptors
     assert options.resolve(most + 1).needs_descriptors
     kept = SelectPairsOptions(method="retrieval", top_k=7).resolve(10)
     assert (kept.method, kept.top_k) == ("retrieval", 7)
     assert kept.resolve(1000) == kept
+    assert most == 1000 and SelectPairsOptions(exhaustive_up_to=7).resolve(8).method != "exhaustive"
     with pytest.raises(ValueError, match="resolve"):
         _ = options.needs_descriptors
+
+
+@pytest.mark.parametrize(
+    ("changes", "detector"),
+    [({}, "aliked"), ({}, ""), ({"preview_keypoints": 0}, "sift"), ({"method": "retrieval"}, "disk")],
+)
+def test_without_a_look_fewer_pairs_are_proposed(changes, detector):
+    options = SelectPairsOptions(**changes)
+    few, many = options.resolve(499, detector=detector), options.resolve(501, detector=detector)
+    assert not few.looks_at_pairs and not many.looks_at_pairs
+    assert (few.top_k, many.top_k) == (15, 30)
+    assert "retrieval" in many.method
+
+
+@pytest.mark.parametrize("method", ["sequential", "listed"])
+def test_what_the_user_orders_is_not_looked_at(method):
+    assert not SelectPairsOptions(method=method).resolve(5, "pairs.txt").looks_at_pairs

@@ -136,7 +136,8 @@ class Scene:
     def select(self, options, pairs_file=""):
         options = options.resolve(len(NAMES), pairs_file)
         descriptors = self.block_files("descriptors") if "retrieval" in options.method else []
-        inputs = {"index": self.file("index"), "descriptors": descriptors}
+        features = self.block_files("features") if options.looks_at_pairs else []
+        inputs = {"index": self.file("index"), "descriptors": descriptors, "features": features}
         select_pairs.run(
             self.job(
                 "select_pairs",
@@ -150,7 +151,8 @@ class Scene:
         rows = []
         for path in self.tile_files("pairs"):
             part = ImagePairs.read(path)
-            rows += list(zip(map(tuple, part.pairs), part.reasons, part.similarities, strict=True))
+            columns = (part.reasons, part.similarities, part.likenesses)
+            rows += list(zip(map(tuple, part.pairs), *columns, strict=True))
         return sorted(rows, key=lambda row: row[0])
 
     def match(self, options=None, former=None):
@@ -241,25 +243,46 @@ def test_vocabulary_and_pairs_do_not_depend_on_the_blocks(whole, dealt):
 
 def test_retrieval_prefers_what_overlaps(dealt):
     rows = dealt.select(SelectPairsOptions(method="retrieval", top_k=1, min_score=0.0))
-    pairs = {pair for pair, _, _ in rows}
+    pairs = {pair for pair, *_ in rows}
     assert pairs & {(0, 1), (0, 5), (1, 5)}
     assert not any(2 in pair or 3 in pair for pair in pairs)
-    assert all(0 < similarity <= 1.001 for _, _, similarity in rows)
+    assert all(0 < similarity <= 1.001 for _, _, similarity, _ in rows)
     vectors = GlobalDescriptors.read(dealt.block_files("descriptors")[0]).descriptors
     assert vectors.shape[1] == 8 * 128
 
 
 def test_auto_takes_all_pairs_of_few_images(dealt):
     rows = dealt.select(SelectPairsOptions())
-    assert [pair for pair, _, _ in rows] == [(i, j) for i in range(6) for j in range(i + 1, 6)]
-    assert {reason for _, reason, _ in rows} == {"exhaustive"}
+    assert [pair for pair, *_ in rows] == [(i, j) for i in range(6) for j in range(i + 1, 6)]
+    assert {reason for _, reason, *_ in rows} == {"exhaustive"}
+
+
+def test_pairs_are_looked_at_and_what_shares_nothing_is_left(dealt, whole):
+    options = SelectPairsOptions(preview_keypoints=100, min_likeness=0.0)
+    rows = dealt.select(options)
+    assert str(rows) == str(whole.select(options))
+    likenesses = {pair: likeness for pair, *_, likeness in rows}
+    overlapping = {(0, 1), (0, 5), (1, 5)}
+    # two images have too few keypoints to be looked at, so their pairs stay
+    assert {pair for pair in likenesses if {2, 3} & {*pair}} == {
+        p for p in likenesses if np.isnan(likenesses[p])
+    }
+    strangers = [likenesses[pair] for pair in likenesses if 4 in pair and not {2, 3} & {*pair}]
+    least = min(likenesses[pair] for pair in overlapping)
+    assert len(strangers) == 3 and max(strangers) < 1.5 < least
+    left = dealt.select(options.model_copy(update={"min_likeness": 1.5}))
+    assert {pair for pair, *_ in left if not {2, 3} & {*pair}} == overlapping
+    fewest = options.model_copy(update={"enough_partners": 1, "enough_likeness": 0.0})
+    kept = {pair for pair, *_ in dealt.select(fewest) if not {2, 3} & {*pair}}
+    # each of four images keeps one
+    assert 2 <= len(kept) <= 4 and max(overlapping, key=likenesses.get) in kept
 
 
 def test_a_list_is_followed(dealt, tmp_path):
     path = tmp_path / "my pairs.txt"
     path.write_text("\ufeffb/ü 2.png a/1 #{x}.png\nother.png bad.jpg\n", "utf-8")
     rows = dealt.select(SelectPairsOptions(), str(path))
-    assert [(pair, reason) for pair, reason, _ in rows] == [((0, 1), "listed")]
+    assert [(pair, reason) for pair, reason, *_ in rows] == [((0, 1), "listed")]
     path.write_text("b/ü 2.png nobody.png\n", "utf-8")
     with pytest.raises(ConfigError, match=r"my pairs.txt:1.*nobody"):
         dealt.select(SelectPairsOptions(), str(path))
@@ -273,12 +296,14 @@ def test_neighbours_by_gps_are_those_on_the_ground(tmp_path, capsys):
     gps = np.array([[47.0, 8.0 + 1e-4 * k, 400.0 * (k % 2)] for k in range(6)])
     gps[2, 2], gps[5] = np.nan, np.nan
     scene = Scene(tmp_path, tmp_path, 2, gps=gps)
-    rows = scene.select(SelectPairsOptions(method="spatial", top_k=1))
-    assert {(0, 1), (3, 4)} <= {pair for pair, _, _ in rows} <= {(a, a + 1) for a in range(4)}
-    assert {reason for _, reason, _ in rows} == {"spatial"} and "1 of 6 images" in capsys.readouterr().out
-    both = scene.select(SelectPairsOptions(method="sequential+spatial", top_k=2, look_ahead=1))
-    assert {"sequential", "sequential+spatial", "spatial"} >= {reason for _, reason, _ in both}
-    assert {(4, 5), (0, 2)} <= {pair for pair, _, _ in both}
+    rows = scene.select(SelectPairsOptions(method="spatial", preview_keypoints=0, top_k=1))
+    assert {(0, 1), (3, 4)} <= {pair for pair, *_ in rows} <= {(a, a + 1) for a in range(4)}
+    assert {reason for _, reason, *_ in rows} == {"spatial"} and "1 of 6 images" in capsys.readouterr().out
+    both = scene.select(
+        SelectPairsOptions(method="sequential+spatial", preview_keypoints=0, top_k=2, look_ahead=1)
+    )
+    assert {"sequential", "sequential+spatial", "spatial"} >= {reason for _, reason, *_ in both}
+    assert {(4, 5), (0, 2)} <= {pair for pair, *_ in both}
 
 
 def test_without_gps_there_are_no_neighbours_by_it(dealt):
@@ -309,7 +334,6 @@ def test_unchanged_images_and_pairs_are_taken_over(dealt, images, tmp_path, monk
     shas = [f"sha of {name}" for name in NAMES]
     shas[4] = "another"
     scene = Scene(tmp_path, images, 3, shas)
-    scene.select(SelectPairsOptions())
     read = []
     original = extract_features.read_image
     monkeypatch.setattr(
@@ -317,6 +341,7 @@ def test_unchanged_images_and_pairs_are_taken_over(dealt, images, tmp_path, monk
     )
     scene.extract(former=dealt)
     assert [Path(path).name for path in read] == ["other.png"]
+    scene.select(SelectPairsOptions())
     capsys.readouterr()
     after = scene.match(former=dealt)
     lines = capsys.readouterr().out.splitlines()

@@ -1,0 +1,134 @@
+"""Pairs are looked at by their largest keypoints, and each image keeps so many partners."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from snakesfm.features.keypoints import KeypointSet
+from snakesfm.features.sift import rootsift
+from snakesfm.retrieval.preview import choose_partners, largest_keypoints, likeness, look_at_pairs
+
+
+def histograms(count, seed):
+    return np.random.default_rng(seed).exponential(size=(count, 128)).astype(np.float32) ** 2
+
+
+def image(descriptors, seed=0):
+    """Keypoints with scales in random order."""
+    rng = np.random.default_rng(seed)
+    count = len(descriptors)
+    places = rng.uniform(0, 500, (count, 2)).astype(np.float32)
+    ones = np.ones(count, np.float32)
+    return KeypointSet(places, rootsift(descriptors), ones, rng.permutation(count).astype(np.float32), ones)
+
+
+def overlapping(count, shared, seed=0):
+    """Two images of ``count`` keypoints that share some of theirs, with noise, at the same scales."""
+    rng = np.random.default_rng(seed)
+    common = histograms(shared, 1)
+    noisy = common * rng.uniform(0.6, 1.4, common.shape).astype(np.float32)
+    first = image(np.concatenate([common, histograms(count - shared, 2)]))
+    second = image(np.concatenate([noisy, histograms(count - shared, 3)]))
+    return first, dataclasses.replace(second, scales=first.scales)
+
+
+def preview(points, count):
+    return points.descriptors[largest_keypoints(points.scales, count)]
+
+
+def test_the_largest_are_chosen_and_few_keypoints_are_not_looked_at():
+    scales = np.random.default_rng(0).permutation(60).astype(np.float32)
+    np.testing.assert_array_equal(largest_keypoints(scales, 20), np.argsort(scales)[::-1][:20])
+    assert largest_keypoints(scales, 31) is None
+    assert largest_keypoints(scales, 30) is not None
+
+
+def test_equal_scales_are_taken_from_the_front():
+    np.testing.assert_array_equal(largest_keypoints(np.ones(60, np.float32), 20), np.arange(20))
+
+
+def test_likeness_grows_with_what_is_shared():
+    values = []
+    for shared in (0, 100, 400, 1000):
+        first, second = (preview(points, 400) for points in overlapping(1000, shared))
+        values.append(likeness(first, second))
+    assert 0 < values[0] < 1.5
+    assert values[1] > 4 * values[0] and values[2] > 2 * values[1] and values[3] > 1.5 * values[2]
+    assert values[3] < 400
+
+
+def test_likeness_of_equal_images_and_of_equal_descriptors_is_finite():
+    some = rootsift(histograms(50, 1))
+    assert likeness(some, some) == pytest.approx(50.0)
+    assert likeness(some[:1].repeat(50, axis=0), some[:1].repeat(50, axis=0)) == 0.0
+
+
+def test_likeness_is_the_same_in_both_directions_for_strangers_and_relatives():
+    for shared in (0, 300):
+        first, second = (preview(points, 300) for points in overlapping(800, shared))
+        assert 0.5 < likeness(first, second) / likeness(second, first) < 2.0
+
+
+@pytest.mark.parametrize("threads", [1, 2, 3])
+def test_pairs_are_looked_at_one_by_one_whatever_the_threads(threads):
+    previews = [rootsift(histograms(40, seed)) for seed in (1, 2, 1)]
+    previews.insert(1, None)
+    pairs = np.array([[0, 1], [0, 2], [0, 3], [2, 3]])
+    looked = look_at_pairs(pairs, previews, threads)
+    assert looked.dtype == np.float32 and np.isnan(looked).tolist() == [True, False, False, False]
+    expected = [likeness(previews[i], previews[j]) for i, j in pairs[1:].tolist()]
+    np.testing.assert_allclose(looked[1:], expected, rtol=1e-6)
+    assert looked[2] == pytest.approx(40.0) and looked[1] < 10
+    assert look_at_pairs(np.zeros((0, 2), int), previews, threads).shape == (0,)
+
+
+def partners_by_hand(pairs, likenesses, enough_partners, enough_likeness):
+    """The rule, image by image, as a person would follow it."""
+    stays = {row for row, value in enumerate(likenesses) if np.isnan(value)}
+    near = (enough_partners + 1) // 2
+    for image in np.unique(pairs):
+        own = [
+            row for row in range(len(pairs)) if image in pairs[row] and row not in stays_unknown(likenesses)
+        ]
+        own.sort(key=lambda row: (-likenesses[row], pairs[row].sum() - image))
+        alternate = own[near : near + 2 * (enough_partners // 2) : 2]
+        turns = own[:near] + alternate + [row for row in own[near:] if row not in alternate]
+        total = 0.0
+        for place, row in enumerate(turns):
+            if place < enough_partners or total < enough_likeness:
+                stays.add(row)
+            total += likenesses[row]
+    return sorted(stays)
+
+
+def stays_unknown(likenesses):
+    return np.flatnonzero(np.isnan(likenesses)).tolist()
+
+
+@pytest.mark.parametrize("enough", [(1, 0.0), (4, 0.0), (5, 20.0), (2, 60.0), (100, 0.0), (1, 1e9)])
+def test_partners_are_chosen_as_by_hand(enough):
+    rng = np.random.default_rng(3)
+    pairs = np.column_stack(np.triu_indices(14, 1))
+    pairs = pairs[rng.permutation(len(pairs))[:70]]
+    # whole numbers, so that many are alike
+    likenesses = np.round(rng.exponential(6.0, len(pairs))).astype(np.float32)
+    likenesses[rng.random(len(pairs)) < 0.1] = np.nan
+    stays = choose_partners(pairs, likenesses, *enough)
+    assert np.flatnonzero(stays).tolist() == partners_by_hand(pairs, likenesses, *enough)
+    order = rng.permutation(len(pairs))
+    np.testing.assert_array_equal(choose_partners(pairs[order], likenesses[order], *enough), stays[order])
+
+
+def test_an_image_of_weak_links_keeps_more_than_enough():
+    pairs = np.column_stack([np.zeros(20, int), np.arange(1, 21)])
+    weak, strong = np.full(20, 2.0, np.float32), np.full(20, 50.0, np.float32)
+    # every other image has one partner and keeps it, so the pairs are listed from the hub's side alone
+    hub = np.concatenate([pairs, [[i, j] for i in range(1, 21) for j in range(21, 24)]])
+    rest = np.full(60, 100.0, np.float32)
+    kept = [choose_partners(hub, np.r_[own, rest], 3, 25.0)[:20].sum() for own in (weak, strong)]
+    assert kept == [13, 3]
+
+
+def test_no_pairs_are_no_partners():
+    assert choose_partners(np.zeros((0, 2), int), np.zeros(0, np.float32), 3, 10.0).shape == (0,)
