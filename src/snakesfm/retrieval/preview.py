@@ -17,6 +17,9 @@ from snakesfm.matching.nearest import augmented, pop_two_largest
 
 Array = NDArray[Any]
 
+# images that see parts of one view are fewer partners apart
+LOOP_STEPS = 4
+
 
 def largest_keypoints(scales: Array, count: int) -> Array | None:
     """Rows (count,) of the keypoints (N,) of largest scale, the earlier of equal ones first.
@@ -75,7 +78,9 @@ def choose_partners(pairs: Array, likenesses: Array, enough_partners: int, enoug
 
     Half of an image's partners are those most alike, the other half every second one of the next: these see
     less of the same, but from farther apart, and poses need both. An image whose partners are alike in
-    little keeps more, as few matches have to be made up for by many pairs.
+    little keeps more, as few matches have to be made up for by many pairs. Last come pairs that close a
+    loop, whose images are more than ``LOOP_STEPS`` partners apart, a tenth of what is enough: in a long
+    sequence that comes back to where it was, neighbours in time are more alike.
 
     Parameters
     ----------
@@ -88,11 +93,8 @@ def choose_partners(pairs: Array, likenesses: Array, enough_partners: int, enoug
     -------
     (P,) bool.
     """
-    known = np.flatnonzero(~np.isnan(likenesses))
     stays = np.isnan(likenesses)
-    images, partners = pairs[known].T.ravel(), pairs[known][:, ::-1].T.ravel()
-    rows, values = np.tile(known, 2), np.tile(likenesses[known].astype(np.float64), 2)
-    ranks = _ranks_within(images, np.lexsort((partners, -values, images)))
+    rows, images, ranks, values = _ranked(pairs, likenesses, np.flatnonzero(~stays))
     order = np.lexsort((_turns(ranks, enough_partners), images))
     places = _ranks_within(images, order)
     sums = np.cumsum(values[order]) - values[order]
@@ -101,7 +103,38 @@ def choose_partners(pairs: Array, likenesses: Array, enough_partners: int, enoug
     sums -= sums[firsts][np.cumsum(firsts) - 1]
     kept = (places[order] < enough_partners) | (sums < enough_likeness)
     stays[rows[order[kept]]] = True
+    left = np.flatnonzero(~stays)
+    closing = left[~_joined(pairs[left], pairs[stays], LOOP_STEPS)]
+    rows, _, ranks, _ = _ranked(pairs, likenesses, closing)
+    stays[rows[ranks < max(1, enough_partners // 10)]] = True
     return stays
+
+
+def _ranked(pairs: Array, likenesses: Array, rows: Array) -> tuple[Array, Array, Array, Array]:
+    """Some pairs, once from either image's side: row, image, the partner's rank for it, likeness."""
+    images, partners = pairs[rows].T.ravel(), pairs[rows][:, ::-1].T.ravel()
+    values = np.tile(likenesses[rows].astype(np.float64), 2)
+    ranks = _ranks_within(images, np.lexsort((partners, -values, images)))
+    return np.tile(rows, 2), images, ranks, values
+
+
+def _joined(pairs: Array, kept: Array, steps: int) -> Array:
+    """Whether at most so many of the kept pairs (K,2) lead from one image of a pair (P,2) to the other."""
+    if len(pairs) == 0:
+        return np.zeros(0, bool)
+    count = 1 + int(max(pairs.max(), kept.max(initial=0)))
+    both = np.concatenate([kept, kept[:, ::-1], np.column_stack([np.arange(count)] * 2)])
+    both = both[np.argsort(both[:, 0], kind="stable")]
+    partners = np.split(both[:, 1], np.searchsorted(both[:, 0], np.arange(1, count)))
+    # one bit per image, so that sets of thousands are joined at once
+    own = np.zeros((count, -(-count // 8)), np.uint8)
+    np.bitwise_or.at(own, (both[:, 0], both[:, 1] // 8), (128 >> both[:, 1] % 8).astype(np.uint8))
+    reached = own
+    for _ in range(steps - 1):
+        reached = np.stack([np.bitwise_or.reduce(reached[rows], axis=0) for rows in partners])
+    first, second = pairs.T
+    joined: Array = reached[first, second // 8] & (128 >> second % 8).astype(np.uint8) > 0
+    return joined
 
 
 def _turns(ranks: Array, enough: int) -> Array:

@@ -99,6 +99,21 @@ def partners_by_hand(pairs, likenesses, enough_partners, enough_likeness):
             if place < enough_partners or total < enough_likeness:
                 stays.add(row)
             total += likenesses[row]
+    joined = {image: {image} for image in pairs.ravel().tolist()}
+    for _ in range(4):
+        joined = {
+            image: near.union(
+                *(set(pairs[row].tolist()) for row in stays if near & set(pairs[row].tolist()))
+            )
+            for image, near in joined.items()
+        }
+    apart = [
+        row for row in range(len(pairs)) if row not in stays and pairs[row][1] not in joined[pairs[row][0]]
+    ]
+    for image in np.unique(pairs):
+        own = [row for row in apart if image in pairs[row]]
+        own.sort(key=lambda row: (-likenesses[row], pairs[row].sum() - image))
+        stays.update(own[: max(1, enough_partners // 10)])
     return sorted(stays)
 
 
@@ -106,11 +121,16 @@ def stays_unknown(likenesses):
     return np.flatnonzero(np.isnan(likenesses)).tolist()
 
 
-@pytest.mark.parametrize("enough", [(1, 0.0), (4, 0.0), (5, 20.0), (2, 60.0), (100, 0.0), (1, 1e9)])
+@pytest.mark.parametrize(
+    "enough", [(1, 0.0), (4, 0.0), (5, 20.0), (2, 60.0), (100, 0.0), (1, 1e9), (20, 0.0)]
+)
 def test_partners_are_chosen_as_by_hand(enough):
     rng = np.random.default_rng(3)
     pairs = np.column_stack(np.triu_indices(14, 1))
     pairs = pairs[rng.permutation(len(pairs))[:70]]
+    # a chain beside it, whose ends are alike, is a loop
+    chain = np.array([[k, k + 1] for k in range(14, 26)] + [[14, 26], [14, 20]])
+    pairs = np.concatenate([pairs, chain])
     # whole numbers, so that many are alike
     likenesses = np.round(rng.exponential(6.0, len(pairs))).astype(np.float32)
     likenesses[rng.random(len(pairs)) < 0.1] = np.nan
@@ -128,6 +148,21 @@ def test_an_image_of_weak_links_keeps_more_than_enough():
     rest = np.full(60, 100.0, np.float32)
     kept = [choose_partners(hub, np.r_[own, rest], 3, 25.0)[:20].sum() for own in (weak, strong)]
     assert kept == [13, 3]
+
+
+def test_a_loop_is_closed_though_neighbours_in_time_are_more_alike():
+    """Every image resembles 20 before and after it, and a little the one half a round away."""
+    count, reach, enough = 120, 20, 10
+    pairs = np.column_stack(np.triu_indices(count, 1))
+    apart = pairs[:, 1] - pairs[:, 0]
+    closing = apart == count // 2
+    likenesses = np.where(closing, 2.0, np.maximum(1 + reach - apart, 0) * 4.0).astype(np.float32)
+    seen = likenesses > 0
+    pairs, likenesses, closing, apart = pairs[seen], likenesses[seen], closing[seen], apart[seen]
+    stays = choose_partners(pairs, likenesses, enough, 0.0)
+    assert stays[closing].all() and closing.sum() == count // 2
+    assert stays[apart == 1].all() and not stays[apart == reach].any()
+    assert 0.5 * enough * count < stays[~closing].sum() < enough * count
 
 
 def test_no_pairs_are_no_partners():
