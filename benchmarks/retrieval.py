@@ -20,8 +20,11 @@ from benchmarks.compare.measure import CommandError, run_measured
 from benchmarks.compare.sets import ImageSet
 from benchmarks.on_sets import Run, SetTable, Value, finished, markdown_head, markdown_row
 from snakesfm.artifacts import GlobalDescriptors, ImageIndex
+from snakesfm.config.select_pairs import SelectPairsOptions
 from snakesfm.evaluation.colmap_model import read_model
 from snakesfm.retrieval.pairs import natural_key
+from snakesfm.retrieval.preview import look_at_pairs
+from snakesfm.stages.select_pairs import read_previews
 
 Array = NDArray[Any]
 
@@ -29,8 +32,11 @@ PAGE = ROOT / "docs" / "retrieval.md"
 SHARED_POINTS = 10
 # pairs per image that a choice may take
 BUDGETS = (3, 5, 10)
-# what describes the images of each choice that retrieves; the others look at nothing but names
+# by the largest keypoints, as select_pairs looks at pairs
+LOOK = "look at sift"
+# what describes the images of each choice that retrieves; 'sequential' looks at nothing but names
 RETRIEVED: dict[str, tuple[str, ...]] = {
+    LOOK: (),
     "vlad of sift": (),
     "vlad of aliked": ("extract_features={method: aliked}",),
     "vlad of xfeat": ("extract_features={method: xfeat}",),
@@ -38,7 +44,7 @@ RETRIEVED: dict[str, tuple[str, ...]] = {
     "megaloc": ("describe_images={method: megaloc}",),
 }
 # what can be measured in minutes with the weights that Python packages hold
-USUAL = ("sequential", "vlad of sift", "vlad of aliked", "vlad of xfeat")
+USUAL = ("sequential", LOOK, "vlad of sift", "vlad of aliked", "vlad of xfeat")
 
 
 def overlapping_pairs(image_set: ImageSet, names: Sequence[str]) -> Array:
@@ -94,12 +100,15 @@ def measure(image_set: ImageSet, choice: str, run: Run) -> dict[str, Any]:
         config += ["select_pairs={method: retrieval}", *RETRIEVED[choice]]
         command = [sys.executable, "-m", "snakemake", "--snakefile", str(ROOT / "Snakefile")]
         command += ["--profile", str(ROOT / "profiles" / "local"), "--cores", str(run.threads)]
-        command += ["--until", "describe_images", "--config", *config]
+        until = "extract_features" if choice == LOOK else "describe_images"
+        command += ["--until", until, "--config", *config]
         try:
             run_measured(command, folder, folder / f"{image_set.name}.log", run.limit_s)
         except CommandError as error:
             return {"failure": str(error)}
-        names, similarities = _similarities(folder / "out" / image_set.name)
+        scene = folder / "out" / image_set.name
+        names = [str(name) for name in ImageIndex.read(scene / "index_images" / "index.h5").names]
+        similarities = (_likenesses if choice == LOOK else _similarities)(scene, len(names))
     overlapping = overlapping_pairs(image_set, names)
     every = len(names) * (len(names) - 1) // 2
     return {
@@ -110,15 +119,24 @@ def measure(image_set: ImageSet, choice: str, run: Run) -> dict[str, Any]:
     }
 
 
-def _similarities(scene: Path) -> tuple[list[str], Array]:
-    """Names of the images, and their similarities (N,N)."""
-    names = [str(name) for name in ImageIndex.read(scene / "index_images" / "index.h5").names]
+def _likenesses(scene: Path, count: int) -> Array:
+    """How much the largest keypoints of all pairs resemble each other, (N,N); 0 where there are too few."""
+    files = sorted((scene / "extract_features").glob("*.h5"))
+    previews = read_previews(files, count, SelectPairsOptions().preview_keypoints)
+    pairs = np.column_stack(np.triu_indices(count, 1))
+    values = np.zeros((count, count))
+    values[tuple(pairs.T)] = np.nan_to_num(look_at_pairs(pairs, previews))
+    return values + values.T
+
+
+def _similarities(scene: Path, count: int) -> Array:
+    """Similarities (N,N) of the images' global descriptors."""
     described: dict[int, Array] = {}
     for path in sorted((scene / "describe_images").glob("*.h5")):
         block = GlobalDescriptors.read(path)
         described |= dict(zip(block.image_ids.tolist(), block.descriptors, strict=True))
-    vectors = np.stack([described[row] for row in range(len(names))])
-    return names, vectors @ vectors.T
+    vectors = np.stack([described[row] for row in range(count)])
+    return vectors @ vectors.T
 
 
 def render(values: Mapping[str, Value], sets: Sequence[str], choices: Sequence[str]) -> str:

@@ -128,8 +128,8 @@ def render_page(results: Sequence[Result], machine: Mapping[str, str], command: 
 
 def _explanation() -> list[str]:
     return [
-        f"**(a)** every method with its own front-end, {FEATURES} features an image (openMVG: its own number), all "
-        "pairs. **(b)** COLMAP's mappers on the database that snakesfm exports "
+        f"**(a)** every method with its own front-end, {FEATURES} features an image (openMVG: its own number); COLMAP "
+        "matches all pairs, snakesfm chooses among all. **(b)** COLMAP's mappers on the database that snakesfm exports "
         "(`export_database`): the same features, pairs and two-view geometries.",
         "",
         "`colmap_incremental` and `colmap_global` (GLOMAP) are pycolmap's `incremental_mapping` and `global_mapping` "

@@ -1,7 +1,8 @@
 """What a job needs, as a cluster's scheduler wants to know it before the job starts: memory and time.
 
 Needs are straight lines above measured jobs (docs/cluster.md), in what a job works on, its images and
-pairs. They never reach a stage, so they cannot change a result.
+pairs; those of select_pairs are the pairs that it looks at. They never reach a stage, so they cannot change
+a result.
 """
 
 import math
@@ -54,7 +55,7 @@ NEEDS = {
     "extract_features": Need("block", 1500, 2.0, image_s=1.8),
     "learn_vocabulary": Need("scene", 1000, 0.01, image_s=0.1),
     "describe_images": Need("block", 500, 0.2, image_s=0.3),
-    "select_pairs": Need("scene", 500, 0.1, 0.0005, image_s=0.2),
+    "select_pairs": Need("scene", 500, 0.15, 0.0005, image_s=0.2, pair_s=0.0012),
     "match_pairs": Need("tile", 400, 0.02, 0.03, pair_s=0.12),
     "merge_keypoints": Need("block", 600, 2.0, 0.1, image_s=1.0),
     "index_matches": Need("tile", 500, 2.0, 0.1, pair_s=0.1),

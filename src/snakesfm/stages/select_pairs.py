@@ -68,7 +68,7 @@ def _look(
     job: StageJob, table: PairTable, images: int, options: "SelectPairsOptions"
 ) -> tuple[Array, Array]:
     """The likeness (P,) of pairs, NaN where an image has too few keypoints, and which stay (P,) bool."""
-    previews = _read_previews(job.paths("features"), images, options.preview_keypoints)
+    previews = read_previews(job.paths("features"), images, options.preview_keypoints)
     likenesses = np.full(len(table.pairs), np.nan, np.float32)
     progress = job.progress(len(likenesses), "pairs looked at")
     for start in range(0, len(likenesses), LOOKS_AT_ONCE):
@@ -82,7 +82,7 @@ def _look(
     return likenesses, stays
 
 
-def _read_previews(paths: list[Path], images: int, count: int) -> list[Array | None]:
+def read_previews(paths: list[Path], images: int, count: int) -> list[Array | None]:
     """Descriptors (count,D) of the largest keypoints of every image of the index, None where too few."""
     previews: list[Array | None] = [None] * images
     for path in paths:
