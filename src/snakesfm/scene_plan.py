@@ -261,28 +261,20 @@ class ScenePlan:
         """The codebook of local descriptors where they describe the images, else nothing."""
         return [] if self.describes_pictures else [str(self.folder / "learn_vocabulary" / "vocabulary.h5")]
 
-    @property
-    def pair_count(self) -> int:
-        """Most pairs that will be chosen, as far as is known before anything runs."""
-        enough = self.select_pairs.enough_partners
-        if not (self.select_pairs.looks_at_pairs and enough):
-            return self.proposed_pair_count
-        return min(self.image_count * enough, self.proposed_pair_count)
-
     @functools.cached_property
     def proposed_pair_count(self) -> int:
-        """Most pairs that the method proposes."""
-        options, images = self.select_pairs, self.image_count
-        everything = images * (images - 1) // 2
-        if options.method == "exhaustive":
-            return everything
-        if options.method == "listed":
-            lines = Path(self.pairs_file).expanduser().read_text("utf-8", errors="replace").splitlines()
-            return min(len(lines), everything)
-        # a similar image is mostly found from one side alone
-        per_image = options.look_ahead * ("sequential" in options.method)
-        per_image += int(options.top_k) * (options.needs_descriptors or "spatial" in options.method)
-        return min(images * per_image, everything)
+        """Most pairs that the method of select_pairs proposes, as far as is known before anything runs."""
+        listed = 0
+        if self.select_pairs.method == "listed":
+            listed = len(
+                Path(self.pairs_file).expanduser().read_text("utf-8", errors="replace").splitlines()
+            )
+        return self.select_pairs.count_proposed(self.image_count, listed)
+
+    @property
+    def pair_count(self) -> int:
+        """Most pairs that will be matched, as far as is known before anything runs."""
+        return self.select_pairs.count_chosen(self.image_count, self.proposed_pair_count)
 
     def load(self, stage: str) -> Load:
         """What one job of a stage works on, on average over the blocks or tiles."""

@@ -48,10 +48,10 @@ class SelectPairsOptions(StageOptions):
     """Least resemblance of these keypoints in a pair that is matched; higher leaves more pairs out."""
 
     enough_partners: int = Field(30, ge=0, le=10_000)
-    """How many of them an image keeps: half the most alike, half every second of the next (0: all)."""
+    """Partners that each image keeps: half the most alike, half every second of the next (0: all)."""
 
     enough_likeness: float = Field(250.0, ge=0.0)
-    """Images keep more than enough partners until their resemblance sums to this."""
+    """Images that resemble theirs little keep more, until likeness sums to this."""
 
     def resolve(self, image_count: int, pairs_file: str = "", detector: str = "sift") -> Self:
         """The options with every 'auto' replaced by what it means for a number of images.
@@ -96,3 +96,20 @@ class SelectPairsOptions(StageOptions):
     def looks_at_pairs(self) -> bool:
         """Whether keypoints are looked at before pairs are chosen, once the options are resolved."""
         return self.preview_keypoints > 0
+
+    def count_proposed(self, images: int, listed: int = 0) -> int:
+        """Most pairs that the method proposes of so many images, or of a list of so many pairs."""
+        everything = images * (images - 1) // 2
+        if self.method == "exhaustive":
+            return everything
+        if self.method == "listed":
+            return min(listed, everything)
+        # a similar image is mostly found from one side alone
+        per_image = self.look_ahead * ("sequential" in self.method)
+        per_image += int(self.top_k) * (self.needs_descriptors or "spatial" in self.method)
+        return min(images * per_image, everything)
+
+    def count_chosen(self, images: int, proposed: int) -> int:
+        """How many of the proposed pairs stay after the look, at most where links are not weak."""
+        limited = self.looks_at_pairs and self.enough_partners > 0
+        return min(images * self.enough_partners, proposed) if limited else proposed
