@@ -24,6 +24,8 @@ from snakesfm.errors import ConfigError
         ({"match_pair": {}}, ["match_pair", "match_pairs"]),
         ({"scenes": {"a": {"images": "x", "camera": "y"}}}, ["scenes.a.camera", "cameras"]),
         ({"extract_features": {"max_keypoints": "many"}}, ["max_keypoints' = 'many'", "or 'auto'"]),
+        ({"match_pairs": {"preview_keypoints": 0}}, ["mean 'select_pairs.preview_keypoints'?"]),
+        ({"max_keypoints": 3000}, ["key 'max_keypoints'", "mean 'extract_features.max_keypoints'?"]),
         ({"seed": -1}, ["seed", "-1"]),
         ({"blocks": 0}, ["'blocks' = 0", "greater than or equal to 1 (or 'auto')."]),
         ({"intrinsics": "free"}, ["intrinsics", "fixed", "refine"]),
