@@ -71,8 +71,8 @@ def test_small_scenes_are_exhaustive_and_large_ones_retrieve(tmp_path: Path) -> 
         assert scene.previewed_features() == scene.files("extract_features", "blocks")
     assert (large.pair_count, large.proposed_pair_count) == (30 * 1001, 110 * 1001)
     assert small.pair_count == small.proposed_pair_count == 10
-    listed = plan_of(tmp_path, images=str(tmp_path / "small"), front_end="aliked+lightglue")
-    assert listed.scenes["small"].previewed_features() == []
+    learned = plan_of(tmp_path, images=str(tmp_path / "small"), front_end="aliked+lightglue")
+    assert learned.scenes["small"].previewed_features() == []
 
 
 def test_params_are_canonical_and_follow_content_not_time(tmp_path: Path) -> None:

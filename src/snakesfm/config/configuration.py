@@ -179,11 +179,9 @@ def _one_sentence(cls: type[BaseModel], error: ValidationError) -> str:
     if first["type"] == "extra_forbidden":
         known = _keys_beside(cls, path)
         elsewhere = [
-            f"{stage}.{path[-1]}" for stage in STAGES if path[-1] in _keys_beside(cls, [stage, ""])
+            f"{stage}.{path[-1]}" for stage in STAGES if path[-1] in options_class(stage).model_fields
         ]
-        if elsewhere:
-            return f"Unknown configuration key '{key}': did you mean '{elsewhere[0]}'?"
-        nearest = difflib.get_close_matches(path[-1], known, n=1, cutoff=0.5)
+        nearest = elsewhere or difflib.get_close_matches(path[-1], known, n=1, cutoff=0.5)
         hint = f"did you mean '{nearest[0]}'" if nearest else f"the known keys are {', '.join(known)}"
         return f"Unknown configuration key '{key}': {hint}?" if nearest else f"Unknown key '{key}': {hint}."
     message = first["msg"].removeprefix("Value error, ")

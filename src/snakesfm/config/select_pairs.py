@@ -77,8 +77,14 @@ class SelectPairsOptions(StageOptions):
         top_k = self.top_k
         if top_k == "auto":
             top_k = SHORTLIST if look else 30 if image_count >= MANY_IMAGES else 15
-        shown = {"preview_keypoints": self.preview_keypoints if look else 0}
-        return self.model_copy(update={"method": method, "exhaustive_up_to": most, "top_k": top_k} | shown)
+        return self.model_copy(
+            update={
+                "method": method,
+                "exhaustive_up_to": most,
+                "top_k": top_k,
+                "preview_keypoints": self.preview_keypoints if look else 0,
+            }
+        )
 
     @property
     def needs_descriptors(self) -> bool:

@@ -99,8 +99,7 @@ def choose_partners(pairs: Array, likenesses: Array, enough_partners: int, enoug
     places = _ranks_within(images, order)
     sums = np.cumsum(values[order]) - values[order]
     # what earlier images sum to is taken off, which is the sum in front of each image's first
-    firsts = places[order] == 0
-    sums -= sums[firsts][np.cumsum(firsts) - 1]
+    sums -= sums[np.arange(len(order)) - places[order]]
     kept = (places[order] < enough_partners) | (sums < enough_likeness)
     stays[rows[order[kept]]] = True
     left = np.flatnonzero(~stays)
@@ -149,8 +148,6 @@ def _turns(ranks: Array, enough: int) -> Array:
 def _ranks_within(groups: Array, order: Array) -> Array:
     """The rank of every element among those of its group, where ``order`` sorts by group first."""
     ordered = groups[order]
-    starts = np.flatnonzero(np.r_[True, ordered[1:] != ordered[:-1]]) if len(ordered) else np.zeros(0, int)
-    lengths = np.diff(np.r_[starts, len(ordered)])
     ranks = np.empty(len(groups), np.int64)
-    ranks[order] = np.arange(len(ordered)) - np.repeat(starts, lengths)
+    ranks[order] = np.arange(len(order)) - np.searchsorted(ordered, ordered)
     return ranks

@@ -98,10 +98,10 @@ def _create_matcher(job: StageJob, options: "MatchPairsOptions") -> Matcher:
         return ImportedMatches(Path(job.settings["imported"]) / MATCHES)
     if options.method == "virtual":
         return create_matcher("virtual")
-    detector = str(job.settings.get("detector", "sift"))
     if options.method == "mutual_ratio":
         names = {"max_ratio", "search", "words", "probes"}
         return create_matcher("mutual_ratio", **options.model_dump(include=names))
+    detector = str(job.settings.get("detector", "sift"))
     return create_matcher(
         options.method,
         detector=detector,
