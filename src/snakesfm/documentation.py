@@ -116,6 +116,11 @@ def render_configuration_page() -> str:
         "`--config KEY=VALUE`; stage options nest: `--config 'extract_features={max_keypoints: 8000}'`. "
         "Unknown keys are refused. Threads, memory and partitions are no options: they belong to the profile.",
         "",
+        "Options in pixels (`_px`) of the stages after matching count in the pixels of the images as the detector sees "
+        "them, scaled down to `extract_features.max_shorter_side_px` (LoFTR: `match_pairs.longer_side_px`), so they "
+        "need not be changed for larger photographs. Keypoints that are imported are taken to come from images of "
+        "that size, too: say with the option which it was. Files hold original pixels.",
+        "",
         "## The run",
         "",
         *_table(RunOptions),

@@ -7,6 +7,7 @@ from typing import Any
 
 from snakesfm.config.configuration import STAGES, list_scenes, load_configuration
 from snakesfm.errors import ConfigError
+from snakesfm.scene_checks import check_scene
 from snakesfm.scene_plan import ScenePlan
 
 
@@ -50,7 +51,7 @@ class Plan:
         if not weights_only:
             _check_writable(self.output)
         for scene in self.scenes.values():
-            scene.check()
+            check_scene(scene)
 
     def scenes_by_blocks(self) -> dict[int, list[str]]:
         """The names of the scenes that have each number of blocks."""

@@ -15,11 +15,12 @@ from snakesfm.config.base import StageOptions
 from snakesfm.config.configuration import STAGES, SceneInputs
 from snakesfm.config.select_pairs import SelectPairsOptions
 from snakesfm.digests import file_digest, file_state, options_digest, settings_text
-from snakesfm.errors import ConfigError
 from snakesfm.front_ends import (
     DETECTOR_FREE,
     FRONT_ENDS,
     LEARNED_DESCRIPTORS,
+    LONGER_SIDE,
+    SHORTER_SIDE,
     check_methods,
     fetch_command,
     needed_weights,
@@ -39,6 +40,13 @@ SCENE_ARTIFACTS = (
     "adjust_bundle/reconstruction.h5",
 )
 
+STAGES_IN_DETECTOR_PIXELS = (
+    "index_matches",
+    "calibrate_cameras",
+    "estimate_two_view",
+    "build_tracks",
+    "triangulate_tracks",
+)
 STAGES_WITH_NETWORKS = ("extract_features", "describe_images", "match_pairs")
 
 
@@ -51,65 +59,6 @@ class ScenePlan:
         self.configuration = configuration
         self.folder = output / name
         check_methods(self.method("extract_features"), self.method("match_pairs"))
-
-    def check(self) -> None:
-        """Refuse paths that are not there, or whose files do not serve.
-
-        Raises
-        ------
-        ConfigError : says which and what to do.
-        """
-        self._check_paths()
-        models = [model for stage in STAGES for model in self.models(stage)]
-        if len(models) > 1 and self.weights.is_file():
-            raise ConfigError(
-                f"weights={self.weights} is one file, but scene '{self.name}' needs those of "
-                f"{len(models)} networks ({', '.join(models)}): give a folder that holds them all."
-            )
-
-    def _check_paths(self) -> None:
-        images = Path(self.inputs.images).expanduser()
-        if not images.is_dir():
-            hint = "make it with 'make demo', or " if self.inputs.images == "demo/images" else ""
-            raise ConfigError(
-                f"The image folder '{images}' does not exist: {hint}say which folder with "
-                "--config images=PATH (name a path with ' #' in it in a file for --configfile: "
-                "Snakemake cuts it there)."
-            )
-        if self.folder.resolve().is_relative_to(images.resolve()):
-            raise ConfigError(
-                f"The output folder '{self.folder.parent}' lies inside the image folder '{images}', so its "
-                "pictures would be taken for photographs: give another output=DIR."
-            )
-        if count_images(images, 1) == 0:
-            raise ConfigError(
-                f"The folder '{images}' holds no JPEG, PNG, TIFF, WebP or BMP image: "
-                "say with --config images=PATH which folder does."
-            )
-        if self.configuration.select_pairs.method == "listed" and not self.pairs_file:
-            raise ConfigError(
-                f"select_pairs.method is 'listed', but scene '{self.name}' has no list: "
-                "give it with pairs=FILE."
-            )
-        methods = (self.method("extract_features"), self.method("match_pairs"))
-        oracle = next((name for name in methods if name in ("virtual", "virtual_places")), "")
-        if oracle and not self.inputs.reference:
-            raise ConfigError(
-                f"The front-end '{oracle}' takes the points of a reference model, but scene '{self.name}' "
-                "has none: give reference=PATH."
-            )
-        if self.method("extract_features") == "imported" and not self.inputs.imported:
-            raise ConfigError(
-                f"The front-end 'imported' reads hloc's files, but scene '{self.name}' names none: "
-                "give imported=DIR."
-            )
-        for key in ("reference", "cameras", "pairs", "imported"):
-            path = getattr(self.inputs, key)
-            if path and not Path(path).expanduser().exists():
-                raise ConfigError(
-                    f"'{path}', given as {key}= for scene '{self.name}', does not exist: "
-                    "correct the path or remove the key."
-                )
 
     def method(self, stage: str) -> str:
         """The method of a stage, by the front-end's name where one is given."""
@@ -223,6 +172,17 @@ class ScenePlan:
     def detector_free(self) -> bool:
         """Whether pairs are matched without keypoints, which are then merged from the matches."""
         return self.method("match_pairs") in DETECTOR_FREE
+
+    @property
+    def detector_pixels(self) -> dict[str, int]:
+        """To which size images are scaled down for the detector; nothing where points are projected."""
+        if self.method("extract_features" if not self.detector_free else "match_pairs").startswith(
+            "virtual"
+        ):
+            return {}
+        if self.detector_free:
+            return {LONGER_SIDE: self.configuration.match_pairs.longer_side_px}
+        return {SHORTER_SIDE: self.configuration.extract_features.max_shorter_side_px}
 
     @property
     def features_stage(self) -> str:
@@ -349,7 +309,8 @@ class ScenePlan:
             settings = {"images": str(self.images), "block": int(wildcards["block"])}
             return settings | self.weight_settings(stage, main_process)
         if stage == "merge_keypoints":
-            return {"images": str(self.images), "block": int(wildcards["block"])}
+            settings = {"images": str(self.images), "block": int(wildcards["block"])}
+            return settings | self.detector_pixels
         if stage == "select_pairs":
             return {
                 "blocks": self.blocks,
@@ -357,7 +318,10 @@ class ScenePlan:
                 "pairs_content": file_digest(self.pairs_file),
             }
         if stage == "adjust_bundle":
-            return {"images": str(self.images), "intrinsics": inputs.intrinsics}
+            settings = {"images": str(self.images), "intrinsics": inputs.intrinsics}
+            return settings | self.detector_pixels
+        if stage in STAGES_IN_DETECTOR_PIXELS:
+            return dict(self.detector_pixels)
         if stage == "export_model":
             return {"images": str(self.images)}
         if stage == "evaluate_model":

@@ -3,6 +3,7 @@
 import json
 import typing
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -22,6 +23,7 @@ from snakesfm.matching.detector_free import DETECTOR_FREE_MATCHERS
 from snakesfm.matching.matcher import MATCHERS
 from snakesfm.plan import Plan
 from snakesfm.retrieval.descriptor import DESCRIPTORS
+from snakesfm.scene_plan import STAGES_IN_DETECTOR_PIXELS
 
 
 def plan_of(tmp_path: Path, **config: object) -> Plan:
@@ -148,6 +150,29 @@ def test_without_keypoints_the_stages_after_matching_read_merged_ones(tmp_path: 
     (sift,) = plan_of(tmp_path).scenes.values()
     assert sift.features_stage == "extract_features" and sift.matches_stage == "match_pairs"
     assert not any("merge_keypoints" in file for file in sift.all_files())
+
+
+@pytest.mark.parametrize(
+    ("config", "expected"),
+    [
+        ({}, {"detector_shorter_side_px": 760}),
+        ({"extract_features": {"max_shorter_side_px": 1520}}, {"detector_shorter_side_px": 1520}),
+        ({"front_end": "xfeat+lighterglue"}, {"detector_shorter_side_px": 760}),
+        ({"front_end": "imported"}, {"detector_shorter_side_px": 760}),
+        ({"front_end": "loftr"}, {"detector_longer_side_px": 840}),
+        ({"front_end": "virtual"}, {}),
+        ({"front_end": "virtual_places"}, {}),
+    ],
+)
+def test_stages_after_matching_are_told_how_large_the_detector_saw_the_images(
+    config: dict[str, Any], expected: dict[str, int], tmp_path: Path
+) -> None:
+    here = str(tmp_path)
+    plan = plan_of(tmp_path, weights=here, reference=here, imported=here, **config)
+    (scene,) = plan.scenes.values()
+    for stage in ("merge_keypoints", *STAGES_IN_DETECTOR_PIXELS, "adjust_bundle"):
+        told = json.loads(scene.params(stage, {"block": "0", "tile": "0-0"}, True))["settings"]
+        assert {name: value for name, value in told.items() if name.startswith("detector_")} == expected
 
 
 def test_networks_that_describe_images_need_no_keypoints_and_no_vocabulary(tmp_path: Path) -> None:

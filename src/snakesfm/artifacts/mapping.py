@@ -90,7 +90,9 @@ class Reconstruction(Artifact):
     round_names: Array = column("(B)", "str", "what each round of the adjustment did")
     round_costs: Array = column("(B,2)", "float64", "robust cost before and after the round")
     round_counts: Array = column("(B,3)", "int64", "images, points and observations after the round")
-    round_errors_px: Array = column("(B)", "float64", "mean reprojection error after the round")
+    round_errors_px: Array = column(
+        "(B)", "float64", "mean reprojection error after the round, in detector pixels"
+    )
 
     @property
     def model_count(self) -> int:

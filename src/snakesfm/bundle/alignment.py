@@ -31,7 +31,7 @@ PATCHES_AT_ONCE = 256
 
 @dataclass(frozen=True)
 class GrayImage:
-    """Gray values (H,W) of an image, and the width and height (2,) of its pixels in original pixels."""
+    """Gray values (H,W) of an image, and the width and height (2,) of its pixels in those of keypoints."""
 
     gray: Array
     scale: Array

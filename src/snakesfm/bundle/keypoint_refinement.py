@@ -47,7 +47,7 @@ def refine_keypoints(
     ----------
     reconstruction : changed in place: keypoints and observations.
     read_gray : gives image k (row, not id), or None where there are no pixels.
-    gray_scales : (N,) how many original pixels a pixel of each gray image is wide, at most.
+    gray_scales : (N,) how many of the keypoints' pixels a pixel of each gray image is wide, at most.
     settings : how.
 
     Returns

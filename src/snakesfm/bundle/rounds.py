@@ -9,7 +9,6 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from snakesfm.bundle.alignment import AlignmentSettings, GrayImage
 from snakesfm.bundle.completion import TrackCompleter
 from snakesfm.bundle.filtering import (
     deregister_images_alone,
@@ -20,6 +19,7 @@ from snakesfm.bundle.filtering import (
     reset_wild_cameras,
     usual_focal_px,
 )
+from snakesfm.bundle.image_sources import ImageSource
 from snakesfm.bundle.interface import BundleAdjuster, Loss, SolverSettings
 from snakesfm.bundle.keypoint_refinement import refine_keypoints
 from snakesfm.bundle.principal_points import find_told_cameras
@@ -75,24 +75,6 @@ class RoundSettings:
 
 
 @dataclass(frozen=True)
-class ImageSource:
-    """Where the pixels come from that keypoints are refined with.
-
-    Parameters
-    ----------
-    read_gray : gives the image of a row, or None where it cannot be read.
-    scales : (N,) how many original pixels a pixel of each gray image is wide, at most.
-    settings : how observations are aligned.
-    report : called with how many observations were aligned or are templates, and how many there are.
-    """
-
-    read_gray: Callable[[int], GrayImage | None]
-    scales: Array
-    settings: AlignmentSettings
-    report: Callable[[int, int], None]
-
-
-@dataclass(frozen=True)
 class RoundRecord:
     """What one round did: robust costs before and after, and the model's size and mean error after it.
 
@@ -123,7 +105,7 @@ def adjust_rounds(
     solving: SolverSettings,
     settings: RoundSettings,
     report: Callable[[RoundRecord], None],
-    source: ImageSource | None = None,
+    sources: Sequence[ImageSource] = (),
 ) -> list[RoundRecord]:
     """Adjust, filter and complete a model in rounds that each start from the result of the one before.
 
@@ -135,21 +117,21 @@ def adjust_rounds(
     solving : how each pass is solved.
     settings : what is done in and between the rounds.
     report : called with each record as soon as it is there.
-    source : the images, where keypoints are to be refined before the last round but one.
+    sources : the images, where keypoints are to be refined before the last round but one, by each in turn.
     """
     mapper = _Mapper(reconstruction, read_graph, cameras, solving, settings, report)
     last = len(settings.thresholds_px) - 1
     if settings.rotations_first:
         mapper.round("rotations fixed", settings.thresholds_px[0] * 2, constant_rotations=True)
     for row, threshold in enumerate(settings.thresholds_px):
-        refine_now = source is not None and row == max(last - 1, 0)
         # what completion adds is not refined, so it ends where refinement begins
-        if row and settings.complete_tracks and (source is None or row < last):
+        if row and settings.complete_tracks and (not sources or row < last):
             mapper.complete()
-        if source is not None and refine_now:
+        for source in sources if row == max(last - 1, 0) else ():
             source.report(
                 *refine_keypoints(reconstruction, source.read_gray, source.scales, source.settings)
             )
+            source.release()
         mapper.round(f"round {row + 1}", threshold, "final" if row == last else "early")
     while settings.register_images and mapper.register():
         mapper.round("registration", settings.thresholds_px[-1], "final")

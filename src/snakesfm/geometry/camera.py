@@ -64,6 +64,22 @@ class Camera:
         params[camera.focal_length_idxs()] *= scale
         return replace(self, params=tuple(params.tolist()), source=source)
 
+    def scaled(self, factor: float, size: tuple[int, int] | None = None) -> "Camera":
+        """The same camera in pixels of another size: ``factor`` of the new ones are one of the old.
+
+        Parameters
+        ----------
+        size : width and height in the new pixels; by default the old ones times ``factor``, rounded.
+        """
+        if factor == 1.0:
+            return self
+        camera = self.to_pycolmap()
+        params = np.array(camera.params)
+        # distortion counts on the plane z = 1, in all of COLMAP's models
+        params[[*camera.focal_length_idxs(), *camera.principal_point_idxs()]] *= factor
+        width, height = size or (round(self.width * factor), round(self.height * factor))
+        return replace(self, width=width, height=height, params=tuple(params.tolist()))
+
 
 def cameras_to_columns(cameras: Sequence[Camera]) -> tuple[list[str], Array, Array, list[str]]:
     """Cameras as columns of an artifact: models, sizes (C,2), params (C,12), sources."""

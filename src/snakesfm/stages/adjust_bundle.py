@@ -1,11 +1,10 @@
 """Stage adjust_bundle: cameras, poses and points adjusted together."""
 
 from dataclasses import replace
-from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import cv2  # must be loaded before pycolmap, whose PNG library clashes otherwise
+import cv2  # noqa: F401 - must be loaded before pycolmap, whose PNG library clashes otherwise
 import numpy as np
 import pycolmap
 
@@ -13,8 +12,9 @@ from snakesfm.artifacts.gather import gather_image_columns, gather_inlier_matche
 from snakesfm.artifacts.images import CalibratedCameras, ImageIndex
 from snakesfm.artifacts.mapping import CameraCenters, CameraRotations, Reconstruction, TriangulatedPoints
 from snakesfm.artifacts.pairs import ViewGraph
-from snakesfm.bundle.alignment import AlignmentSettings, GrayImage
+from snakesfm.bundle.alignment import AlignmentSettings
 from snakesfm.bundle.completion import correspondence_graph
+from snakesfm.bundle.image_sources import ImageSource, open_image_sources
 from snakesfm.bundle.interface import SolverSettings
 from snakesfm.bundle.keypoint_refinement import most_share_a_camera
 from snakesfm.bundle.model import (
@@ -26,14 +26,19 @@ from snakesfm.bundle.model import (
 from snakesfm.bundle.models import join_models, restrict_to
 from snakesfm.bundle.reading import observed_keypoints
 from snakesfm.bundle.rounds import (
-    ImageSource,
     RoundRecord,
     RoundSettings,
     adjust_rounds,
     mean_point_errors,
 )
-from snakesfm.errors import ImageError, SceneError
+from snakesfm.errors import SceneError
 from snakesfm.geometry.camera import cameras_from_columns, cameras_to_columns
+from snakesfm.geometry.detector_pixels import (
+    detector_scales,
+    reduce_cameras,
+    reduce_keypoints,
+    restore_cameras,
+)
 from snakesfm.geometry.poses import translation_of
 from snakesfm.stages.job import StageJob
 from snakesfm.triangulation.tracks import mean_colors
@@ -41,7 +46,6 @@ from snakesfm.triangulation.tracks import mean_colors
 if TYPE_CHECKING:
     from snakesfm.config.adjust_bundle import AdjustBundleOptions
 
-KEPT_IMAGES = 256
 SMALLEST_FURTHER_MODEL = 3
 
 
@@ -54,10 +58,11 @@ def run(job: StageJob) -> None:
     """
     index = ImageIndex.read(job.path("index"))
     columns = CalibratedCameras.read(job.path("cameras"))
+    originals = cameras_from_columns(columns.models, columns.sizes, columns.params, columns.sources)
     averaged = CameraRotations.read(job.path("rotations"))
     centers = CameraCenters.read(job.path("centers")).centers
     poses = BundleModel(
-        tuple(cameras_from_columns(columns.models, columns.sizes, columns.params, columns.sources)),
+        tuple(reduce_cameras(originals, job.settings)),
         index.camera_ids,
         averaged.rotations,
         translation_of(averaged.rotations, centers),
@@ -88,9 +93,11 @@ def run(job: StageJob) -> None:
             "fit the tracks; check the cameras' focal lengths, or lower adjust_bundle.min_observations."
         )
     adjusted.sort(key=lambda found: -found[0].registered.sum())
-    joined, models = join_models([found for found, _ in adjusted], cameras)
+    final = tuple(restore_cameras(cameras, originals, job.settings))
+    joined, models = join_models([found for found, _ in adjusted], final)
     pixels = np.concatenate([observed for _, observed in adjusted])
-    _write(job, joined, models, pixels, records)
+    scales = detector_scales(index.sizes, job.settings).astype(np.float32)
+    _write(job, joined, models, pixels * scales[joined.image_ids, None], records)
 
 
 def _adjust(
@@ -104,6 +111,8 @@ def _adjust(
 ) -> tuple[BundleModel, np.ndarray, list[RoundRecord]]:
     """One component's model adjusted, its observed keypoints (L,2) float32, and its rounds.
 
+    All in detector pixels.
+
     Parameters
     ----------
     poses : cameras and poses to start from, without points.
@@ -112,7 +121,7 @@ def _adjust(
     prefix : goes before the names of the rounds.
     """
     options: AdjustBundleOptions = job.options
-    reconstruction = _start(job, poses, index.names.tolist())
+    reconstruction = _start(job, index, poses)
     pairs = np.concatenate(
         [_usable_pairs(view_graph, poses), refused[poses.registered[refused].all(axis=1)]]
     )
@@ -139,23 +148,25 @@ def _adjust(
     refines = options.refine_keypoints
     if refines == "auto":
         refines = most_share_a_camera(index.camera_ids)
-    source = _image_source(job, index) if refines else None
+    sources = _image_sources(job, index) if refines else []
     reported: list[RoundRecord] = []
 
     def report(record: RoundRecord) -> None:
         reported.append(replace(record, name=prefix + record.name))
         _print_record(reported[-1])
 
-    adjust_rounds(reconstruction, read_graph, poses.cameras, solving, settings, report, source)
+    adjust_rounds(reconstruction, read_graph, poses.cameras, solving, settings, report, sources)
     result = from_reconstruction(reconstruction, poses)
     observed = observed_keypoints(reconstruction, result.image_ids, result.keypoint_ids)
     return result, observed.astype(np.float32), reported
 
 
-def _start(job: StageJob, poses: BundleModel, names: list[str]) -> pycolmap.Reconstruction:
+def _start(job: StageJob, index: ImageIndex, poses: BundleModel) -> pycolmap.Reconstruction:
     """The poses with the triangulated points that they see; it alone stays in memory."""
     start = TriangulatedPoints.read(job.path("points"))
-    (keypoints,) = gather_image_columns(job.paths("features"), len(names), "keypoints")
+    (keypoints,) = gather_image_columns(job.paths("features"), len(index.names), "keypoints")
+    scales = detector_scales(index.sizes, job.settings).tolist()
+    reduced = [reduce_keypoints(found, scale) for found, scale in zip(keypoints, scales, strict=True)]
     model = replace(
         poses,
         points=start.points,
@@ -163,7 +174,7 @@ def _start(job: StageJob, poses: BundleModel, names: list[str]) -> pycolmap.Reco
         image_ids=start.image_ids,
         keypoint_ids=start.keypoint_ids,
     )
-    return to_reconstruction(restrict_to(model, poses.registered), keypoints, names)
+    return to_reconstruction(restrict_to(model, poses.registered), reduced, index.names.tolist())
 
 
 def _usable_pairs(graph: ViewGraph, poses: BundleModel) -> np.ndarray:
@@ -173,34 +184,16 @@ def _usable_pairs(graph: ViewGraph, poses: BundleModel) -> np.ndarray:
     return usable
 
 
-def _image_source(job: StageJob, index: ImageIndex) -> ImageSource:
-    """The images in gray, scaled down; the last ones are kept, as each is read twice."""
-    from snakesfm.ingest.read import read_image
-
+def _image_sources(job: StageJob, index: ImageIndex) -> list[ImageSource]:
+    """The images in gray at the sizes at which keypoints are refined."""
     options: AdjustBundleOptions = job.options
-    side = options.refine_shorter_side_px
     folder = Path(job.settings["images"])
-    # the images are worked on side by side
-    cv2.setNumThreads(1)
-
-    @lru_cache(maxsize=KEPT_IMAGES)
-    def read_gray(row: int) -> GrayImage | None:
-        try:
-            image = read_image(folder / str(index.names[row]), side)
-        except ImageError as error:
-            print(f"warning: {error}")
-            return None
-        height, width = image.gray.shape
-        factor = min(1.0, side / min(height, width))
-        size = (max(1, round(width * factor)), max(1, round(height * factor)))
-        gray = image.gray if factor == 1.0 else cv2.resize(image.gray, size, interpolation=cv2.INTER_AREA)
-        return GrayImage(gray, image.reduction * np.array([width, height]) / np.array(size))
-
-    return ImageSource(
-        read_gray,
-        np.maximum(1.0, index.sizes.min(axis=1) / side),
+    return open_image_sources(
+        [folder / str(name) for name in index.names],
+        index.sizes,
+        detector_scales(index.sizes, job.settings),
+        options.refine_finenesses,
         AlignmentSettings(options.refine_radius_px, options.refine_min_correlation, threads=job.threads),
-        lambda aligned, count: print(f"keypoints refined: {aligned} of {count} observations", flush=True),
     )
 
 

@@ -11,6 +11,12 @@ from snakesfm.artifacts.features import LocalFeatures
 from snakesfm.artifacts.images import CalibratedCameras, ImageIndex
 from snakesfm.artifacts.pairs import PairMatches
 from snakesfm.geometry.camera import Camera, cameras_from_columns, cameras_to_columns
+from snakesfm.geometry.detector_pixels import (
+    detector_scales,
+    reduce_cameras,
+    reduce_keypoints,
+    restore_cameras,
+)
 from snakesfm.stages.job import StageJob
 
 if TYPE_CHECKING:
@@ -55,7 +61,8 @@ def _calibrate(
         options.pairs_per_camera,
         options.min_matches,
     )
-    keypoints = _read_keypoints(job.paths("features"), set(candidates[chosen, :2].ravel().tolist()))
+    scales = detector_scales(index.sizes, job.settings)
+    keypoints = _read_keypoints(job.paths("features"), set(candidates[chosen, :2].ravel().tolist()), scales)
     progress = job.progress(len(chosen), "pairs")
     pairs = []
     for row in chosen.tolist():
@@ -76,8 +83,8 @@ def _calibrate(
                 )
             )
         progress.step()
-    result = calibrate_focals(pairs, cameras, options, job.threads)
-    return result.cameras, result.sigmas, result.pair_counts
+    result = calibrate_focals(pairs, reduce_cameras(cameras, job.settings), options, job.threads)
+    return restore_cameras(result.cameras, cameras, job.settings), result.sigmas, result.pair_counts
 
 
 def _read_counts(paths: Iterable[Path]) -> tuple[Array, list[tuple[Path, int, int]]]:
@@ -95,14 +102,16 @@ def _read_counts(paths: Iterable[Path]) -> tuple[Array, list[tuple[Path, int, in
     return table, [places[k] for k in order]
 
 
-def _read_keypoints(paths: Iterable[Path], images: set[int]) -> dict[int, Array]:
+def _read_keypoints(paths: Iterable[Path], images: set[int], scales: Array) -> dict[int, Array]:
+    """Keypoints (K,2) of the images in detector pixels."""
     keypoints: dict[int, Array] = {}
     for path in paths:
         with LocalFeatures.open(path) as file:
             offsets = file["offsets"][()]
             for row, image in enumerate(file["image_ids"][()].tolist()):
                 if image in images:
-                    keypoints[image] = file["keypoints"][offsets[row] : offsets[row + 1]]
+                    found = file["keypoints"][offsets[row] : offsets[row + 1]]
+                    keypoints[image] = reduce_keypoints(found, scales[image])
     return keypoints
 
 

@@ -15,6 +15,7 @@ from snakesfm.artifacts.images import CalibratedCameras, ImageIndex
 from snakesfm.artifacts.pairs import KINDS, REJECTIONS, PairMatches, TwoViewGeometries
 from snakesfm.errors import ArtifactError
 from snakesfm.geometry.camera import Camera, cameras_from_columns
+from snakesfm.geometry.detector_pixels import detector_scales, reduce_cameras, reduce_keypoints
 from snakesfm.stages.job import StageJob
 from snakesfm.two_view.correspondences import first_rows_at_place, unify_matches
 from snakesfm.two_view.estimate import TwoViewEstimate, estimate_two_view_geometry
@@ -34,11 +35,15 @@ def run(job: StageJob) -> None:
     options: EstimateTwoViewOptions = job.options
     index = ImageIndex.read(job.path("index"))
     cameras = CalibratedCameras.read(job.path("cameras"))
-    of_camera = cameras_from_columns(cameras.models, cameras.sizes, cameras.params, cameras.sources)
+    of_camera = reduce_cameras(
+        cameras_from_columns(cameras.models, cameras.sizes, cameras.params, cameras.sources), job.settings
+    )
     matches = PairMatches.read(job.path("matches"))
-    keypoints, image_digests = _read_keypoints(job.paths("features"), set(matches.pairs.ravel().tolist()))
+    images = set(matches.pairs.ravel().tolist())
+    scales = detector_scales(index.sizes, job.settings)
+    keypoints, image_digests = _read_keypoints(job.paths("features"), images, scales)
     places = {image: first_rows_at_place(points) for image, points in keypoints.items()}
-    for image in set(matches.pairs.ravel().tolist()) - keypoints.keys():
+    for image in images - keypoints.keys():
         raise ArtifactError(
             f"{job.path('matches')} names image {index.names[image]}, which no features file "
             "holds: delete both and run again."
@@ -76,7 +81,10 @@ def run(job: StageJob) -> None:
     print(_summary(rows, reused), flush=True)
 
 
-def _read_keypoints(paths: Iterable[Path], images: set[int]) -> tuple[dict[int, Array], dict[int, str]]:
+def _read_keypoints(
+    paths: Iterable[Path], images: set[int], scales: Array
+) -> tuple[dict[int, Array], dict[int, str]]:
+    """Keypoints (K,2) of the images in detector pixels, and the digests of the images."""
     keypoints: dict[int, Array] = {}
     digests: dict[int, str] = {}
     for path in paths:
@@ -86,7 +94,8 @@ def _read_keypoints(paths: Iterable[Path], images: set[int]) -> tuple[dict[int, 
             flat = file["keypoints"][()]
             for row, image in enumerate(ids.tolist()):
                 if image in images:
-                    keypoints[image] = flat[offsets[row] : offsets[row + 1]]
+                    found = flat[offsets[row] : offsets[row + 1]]
+                    keypoints[image] = reduce_keypoints(found, scales[image])
                     digests[image] = str(names[row])
     return keypoints, digests
 
@@ -105,7 +114,7 @@ def _digest(
     options: "EstimateTwoViewOptions",
     seed: int,
 ) -> str:
-    """Digest of all that a pair's result depends on."""
+    """Digest of all that a pair's result depends on; cameras in detector pixels tell the images' scales."""
     named = {
         "images": image_digests,
         # the source of a focal length does not change the geometry

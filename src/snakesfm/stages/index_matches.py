@@ -1,13 +1,13 @@
 """Express the matches of one tile, found without keypoints, in the merged keypoints of its images."""
 
 import hashlib
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from snakesfm.artifacts.features import LocalFeatures
 from snakesfm.artifacts.pairs import PairCoordinates, PairMatches
+from snakesfm.geometry.detector_pixels import detector_scales, reduce_keypoints
 from snakesfm.matching.merging import MergedKeypoints, index_coordinates
 from snakesfm.stages.job import StageJob
 
@@ -19,13 +19,19 @@ def run(job: StageJob) -> None:
     """Write the tile's PairMatches."""
     options: IndexMatchesOptions = job.options
     tile = PairCoordinates.read(job.path("matches"))
-    merged, digests = _read_features(job.paths("features"))
+    merged, digests, scales = _read_features(job)
     # an empty pair in front keeps shapes and dtypes where the tile has no pair
     matches, scores = [np.zeros((0, 2), np.int32)], [np.zeros(0, np.float32)]
     for row, (i, j) in enumerate(tile.pairs.tolist()):
         part = slice(tile.offsets[row], tile.offsets[row + 1])
+        coordinates = np.hstack(
+            [
+                reduce_keypoints(tile.coordinates[part, :2], scales[i]),
+                reduce_keypoints(tile.coordinates[part, 2:], scales[j]),
+            ]
+        )
         found, sure = index_coordinates(
-            tile.coordinates[part], tile.scores[part], merged[i], merged[j], options.max_distance_px
+            coordinates, tile.scores[part], merged[i], merged[j], options.max_distance_px
         )
         matches.append(found)
         scores.append(sure)
@@ -48,12 +54,15 @@ def run(job: StageJob) -> None:
     )
 
 
-def _read_features(paths: list[Path]) -> tuple[dict[int, MergedKeypoints], dict[int, str]]:
-    """Keypoints and digests of the tile's images."""
-    merged, digests = {}, {}
-    for path in paths:
+def _read_features(job: StageJob) -> tuple[dict[int, MergedKeypoints], dict[int, str], dict[int, float]]:
+    """Keypoints in detector pixels, digests and scales of the tile's images."""
+    merged, digests, scales = {}, {}, {}
+    for path in job.paths("features"):
         block = LocalFeatures.read(path)
+        widths = detector_scales(block.sizes, job.settings).tolist()
         for row, image in enumerate(block.image_ids.tolist()):
-            merged[image] = MergedKeypoints(block.keypoints[block.offsets[row] : block.offsets[row + 1]])
+            keypoints = block.keypoints[block.offsets[row] : block.offsets[row + 1]]
+            merged[image] = MergedKeypoints(reduce_keypoints(keypoints, widths[row]))
             digests[image] = str(block.digests[row])
-    return merged, digests
+            scales[image] = widths[row]
+    return merged, digests, scales

@@ -13,6 +13,7 @@ from snakesfm.artifacts.images import ImageIndex
 from snakesfm.artifacts.pairs import PairCoordinates
 from snakesfm.errors import ImageError
 from snakesfm.features.extraction import sample_colors
+from snakesfm.geometry.detector_pixels import detector_scales, reduce_keypoints
 from snakesfm.ingest.read import read_image
 from snakesfm.matching.merging import merge_coordinates
 from snakesfm.stages.job import StageJob
@@ -40,8 +41,11 @@ def run(job: StageJob) -> None:
     # an empty set in front keeps shapes and dtypes where the block has no image
     keypoints, scores = [np.zeros((0, 2), np.float32)], [np.zeros(0, np.float32)]
     colors = [np.zeros((0, 3), np.uint8)]
-    for row in rows.tolist():
-        merged, sure = merge_coordinates(*found[row], options.radius_px)
+    scales = detector_scales(index.sizes[rows], job.settings).tolist()
+    for row, scale in zip(rows.tolist(), scales, strict=True):
+        places, confidences = found[row]
+        merged, sure = merge_coordinates(reduce_keypoints(places, scale), confidences, options.radius_px)
+        merged = reduce_keypoints(merged, 1.0 / scale)
         keypoints.append(merged)
         scores.append(sure)
         colors.append(_read_colors(folder / str(index.names[row]), merged))

@@ -8,6 +8,7 @@ from snakesfm.artifacts.images import CalibratedCameras, ImageIndex
 from snakesfm.artifacts.mapping import CameraCenters, CameraRotations, TrackTable, TriangulatedPoints
 from snakesfm.errors import SceneError
 from snakesfm.geometry.camera import cameras_from_columns
+from snakesfm.geometry.detector_pixels import detector_scales, reduce_cameras
 from snakesfm.geometry.poses import translation_of
 from snakesfm.stages.job import StageJob
 from snakesfm.triangulation.interface import TriangulationLimits
@@ -31,14 +32,15 @@ def run(job: StageJob) -> None:
     rotations = CameraRotations.read(job.path("rotations")).rotations
     centers = CameraCenters.read(job.path("centers")).centers
     tracks = TrackTable.read(job.path("tracks"))
+    scales = detector_scales(index.sizes, job.settings).astype(np.float32)
     points, kept = triangulate_tracks(
-        cameras,
+        reduce_cameras(cameras, job.settings),
         index.camera_ids,
         rotations,
         translation_of(rotations, centers),
         tracks.offsets,
         tracks.image_ids,
-        tracks.keypoints,
+        tracks.keypoints / scales[tracks.image_ids, None],
         TriangulationLimits(
             options.max_reprojection_error_px,
             options.min_angle_deg,

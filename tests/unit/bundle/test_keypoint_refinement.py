@@ -115,6 +115,33 @@ def test_keypoints_of_a_point_come_to_agree(scene, scale, least, most):
     assert least < after < most
 
 
+def disagreement_px(reconstruction, poses) -> float:
+    """How far the keypoints of a point are from each other on the plane, median in its texture's pixels."""
+    points, point_of, images, rows = observations_of(reconstruction)
+    pixels = observed_keypoints(reconstruction, images, rows)
+    to_plane = np.array([np.linalg.inv(plane_to_image(*pose)) for pose in poses])
+    places = np.einsum("lij,lj->li", to_plane[images], np.column_stack([pixels, np.ones(len(pixels))]))
+    places = TEXTURE_PX_PER_UNIT * places[:, :2] / places[:, 2:]
+    sums = np.zeros((len(points), 2))
+    np.add.at(sums, point_of, places)
+    means = sums / np.bincount(point_of)[:, None]
+    return float(np.median(np.linalg.norm(places - means[point_of], axis=1)))
+
+
+def test_finer_images_bring_keypoints_closer_together(scene):
+    reconstruction = model_of(scene, 0.7)
+    found = [disagreement_px(reconstruction, scene[2])]
+    for scale, radius in ((4.0, 5), (2.0, 8), (1.0, 13)):
+        settings = AlignmentSettings(radius)
+        refine_keypoints(reconstruction, read(scene[1], scale), np.full(5, scale), settings)
+        found.append(disagreement_px(reconstruction, scene[2]))
+    start, coarse, fine, finest = found
+    assert 0.5 < start < 1.2
+    assert 0.04 < coarse < 0.08
+    assert fine < 0.8 * coarse
+    assert 0.01 < finest < 0.8 * fine
+
+
 def test_an_observation_of_something_else_is_dropped_and_an_image_of_another_look_is_not(scene):
     images = [image.copy() for image in scene[1]]
     other = texture(9)[:300, :400]

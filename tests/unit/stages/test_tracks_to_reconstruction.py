@@ -1,5 +1,7 @@
 """The stages from tracks to the adjusted model, on a small synthetic scene."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from synthetic_scene import HEADER, write_scene
@@ -18,6 +20,7 @@ from snakesfm.config.adjust_bundle import AdjustBundleOptions
 from snakesfm.config.build_tracks import BuildTracksOptions
 from snakesfm.config.triangulate_tracks import TriangulateTracksOptions
 from snakesfm.errors import SceneError
+from snakesfm.geometry.camera import cameras_to_columns
 from snakesfm.geometry.rotations import angle_of
 from snakesfm.stages import adjust_bundle, build_tracks, triangulate_tracks
 from snakesfm.stages.job import StageJob
@@ -54,10 +57,13 @@ def run(stage, options, inputs, output, **settings):
     stage.run(StageJob(stage.__name__.split(".")[-1], "scene", inputs, (output,), options, settings, 1))
 
 
-def run_all(inputs, tmp_path, name="model.h5", **options):
-    run(build_tracks, BuildTracksOptions(), inputs, inputs["tracks"])
-    run(triangulate_tracks, TriangulateTracksOptions(), inputs, inputs["points"])
-    settings = {"intrinsics": "fixed", "images": str(tmp_path / "images")}
+def run_all(inputs, tmp_path, name="model.h5", detector_shorter_side_px=None, **options):
+    side = (
+        {} if detector_shorter_side_px is None else {"detector_shorter_side_px": detector_shorter_side_px}
+    )
+    run(build_tracks, BuildTracksOptions(), inputs, inputs["tracks"], **side)
+    run(triangulate_tracks, TriangulateTracksOptions(), inputs, inputs["points"], **side)
+    settings = {"intrinsics": "fixed", "images": str(tmp_path / "images"), **side}
     run(adjust_bundle, AdjustBundleOptions(**options), inputs, tmp_path / name, **settings)
     return Reconstruction.read(tmp_path / name)
 
@@ -91,6 +97,36 @@ def test_stages_in_a_row(made, inputs, tmp_path, capsys):
     np.testing.assert_array_equal(
         model.keypoints, np.concatenate(made.keypoints)[base[model.image_ids] + model.keypoint_ids]
     )
+
+
+def test_larger_photographs_give_the_same_model(made, inputs, tmp_path):
+    """Four is a power of two, so all numbers are the same but for their exponents."""
+    small = run_all(inputs, tmp_path, refine_keypoints=False)
+    large_made = replace(
+        made,
+        cameras=tuple(camera.scaled(4.0) for camera in made.cameras),
+        keypoints=tuple(keypoints * 4 for keypoints in made.keypoints),
+    )
+    folder = tmp_path / "large"
+    folder.mkdir()
+    paths = write_scene(large_made, folder) | {name: inputs[name] for name in ("rotations", "centers")}
+    shorter = min(made.cameras[0].width, made.cameras[0].height)
+    large = run_all(paths, folder, detector_shorter_side_px=shorter, refine_keypoints=False)
+    np.testing.assert_array_equal(large.rotations, small.rotations)
+    np.testing.assert_array_equal(large.translations, small.translations)
+    np.testing.assert_array_equal(large.points, small.points)
+    np.testing.assert_array_equal(large.keypoint_ids, small.keypoint_ids)
+    np.testing.assert_array_equal(large.keypoints, 4 * small.keypoints)
+    np.testing.assert_array_equal(large.camera_params, [camera_row(c) for c in large_made.cameras])
+    np.testing.assert_array_equal(large.round_errors_px, small.round_errors_px)
+    np.testing.assert_allclose(large.errors_px, 4 * small.errors_px, rtol=1e-9, atol=1e-9)
+    strict = run_all(paths, folder, refine_keypoints=False)
+    assert len(strict.image_ids) < len(small.image_ids)
+
+
+def camera_row(camera):
+    """A camera's parameters as artifacts hold them."""
+    return cameras_to_columns([camera])[2][0]
 
 
 def test_same_bytes_again(inputs, tmp_path):

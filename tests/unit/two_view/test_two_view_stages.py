@@ -29,14 +29,14 @@ Views = Callable[..., Any]
 HEADER = Header("test", 1, "scene")
 
 
-def write_inputs(folder: Path, views: Any, source: str) -> dict[str, Any]:
+def write_inputs(folder: Path, views: Any, source: str, enlarged: int = 1) -> dict[str, Any]:
     """Three images of which 0 and 1 are a pair; image 2 matches image 0 in twelve places only."""
-    camera = Camera("SIMPLE_RADIAL", 1000, 800, (900.0, 500.0, 400.0, 0.0), source)
+    camera = Camera("SIMPLE_RADIAL", 1000, 800, (900.0, 500.0, 400.0, 0.0), source).scaled(enlarged)
     models, sizes, params, sources = cameras_to_columns([camera])
     names = np.array(["a.jpg", "b.jpg", "c.jpg"], dtype=object)
     ImageIndex(
         names=names,
-        sizes=np.tile(np.array([1000, 800], dtype=np.int32), (3, 1)),
+        sizes=np.tile(sizes, (3, 1)),
         sha256=names,
         blocks=np.zeros(3, dtype=np.int32),
         camera_ids=np.zeros(3, dtype=np.int32),
@@ -68,7 +68,7 @@ def write_inputs(folder: Path, views: Any, source: str) -> dict[str, Any]:
         digests=np.array(["da", "db", "dc"], dtype=object),
         sizes=np.tile([640, 480], (3, 1)),
         offsets=np.cumsum([0, *(len(k) for k in keypoints)]),
-        keypoints=np.concatenate(keypoints),
+        keypoints=np.concatenate(keypoints) * enlarged,
         descriptors=np.zeros((total, 8), dtype=np.uint8),
         scores=np.ones(total, dtype=np.float32),
         scales=np.ones(total, dtype=np.float32),
@@ -113,6 +113,26 @@ def test_pairs_of_a_tile(two_views: Views, tmp_path: Path, capsys: pytest.Captur
     assert found.offsets.tolist() == [0, found.inlier_counts[0], found.inlier_counts[0]]
     assert len(found.inliers) > 200
     assert "1 of 2 pairs accepted" in capsys.readouterr().out
+
+
+def test_larger_photographs_are_judged_as_the_detector_saw_them(two_views: Views, tmp_path: Path) -> None:
+    views, rows = two_views(seed=1), {}
+    for name, enlarged, settings in [
+        ("small", 1, {}),
+        ("large", 4, {"detector_shorter_side_px": 800}),
+        ("strict", 4, {}),
+    ]:
+        folder = tmp_path / name
+        folder.mkdir()
+        inputs = write_inputs(folder, views, "given", enlarged)
+        estimate_two_view.run(pose_job(folder, inputs, settings=settings))
+        rows[name] = TwoViewGeometries.read(folder / "0-0.h5")
+    np.testing.assert_array_equal(rows["large"].inliers, rows["small"].inliers)
+    np.testing.assert_array_equal(rows["large"].rotations, rows["small"].rotations)
+    np.testing.assert_array_equal(rows["large"].covariances, rows["small"].covariances)
+    # what is known of the small photographs is not taken for the large ones judged in their own pixels
+    assert rows["large"].digests[0] == rows["small"].digests[0] != rows["strict"].digests[0]
+    assert not np.array_equal(rows["strict"].rotations, rows["small"].rotations)
 
 
 def test_run_again_gives_the_same_bytes(two_views: Views, tmp_path: Path) -> None:
@@ -189,6 +209,23 @@ def test_calibration_stage_estimates(two_views: Views, tmp_path: Path) -> None:
     found = CalibratedCameras.read(tmp_path / "out.h5")
     assert found.params[0, 0] == pytest.approx(900.0, rel=0.1)
     assert found.params[0, 3] == 0.0
+
+
+def test_larger_photographs_have_longer_focal_lengths(two_views: Views, tmp_path: Path) -> None:
+    views, found = two_views(seed=8, count=400), []
+    for enlarged in (1, 4):
+        inputs = write_inputs(tmp_path, views, "exif", enlarged)
+        options = CalibrateCamerasOptions(min_votes=1, systematic_sigma=0.0, max_sigma=10.0)
+        settings = {"detector_shorter_side_px": 800}
+        job = StageJob("calibrate_cameras", "scene", inputs, (tmp_path / "out.h5",), options, settings, 5)
+        calibrate_cameras.run(job)
+        found.append(CalibratedCameras.read(tmp_path / "out.h5"))
+    small, large = found
+    np.testing.assert_array_equal(large.sizes, 4 * small.sizes)
+    np.testing.assert_array_equal(large.params[0, :3], 4 * small.params[0, :3])
+    np.testing.assert_array_equal(large.params[0, 3:], small.params[0, 3:])
+    assert large.sources.tolist() == small.sources.tolist() == ["estimated"]
+    np.testing.assert_array_equal(large.focal_sigma, small.focal_sigma)
 
 
 def test_calibration_stage_without_pairs(two_views: Views, tmp_path: Path) -> None:

@@ -1,0 +1,114 @@
+"""The images in gray, at the sizes at which keypoints are refined."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from snakesfm.bundle.alignment import AlignmentSettings, GrayImage
+from snakesfm.errors import ImageError
+
+Array = NDArray[Any]
+
+HELD_PIXELS = 256 * 760 * 1140
+"""Gray values that are kept, as each image is read twice: those of so many photographs of usual size."""
+LEAST_GAIN = 1.25
+"""Images that are less finer than those before tell nothing new."""
+RADIUS_GROWTH = 0.68
+"""Patches grow by 1.6 where images are twice as fine: they show less of a surface, but not noise alone."""
+
+
+@dataclass(frozen=True)
+class ImageSource:
+    """Where the pixels come from that keypoints are refined with.
+
+    Parameters
+    ----------
+    read_gray : gives the image of a row, or None where it cannot be read.
+    scales : (N,) how many detector pixels a pixel of each gray image is wide, at most.
+    settings : how observations are aligned.
+    report : called with how many observations were aligned or are templates, and how many there are.
+    release : frees the images that are kept.
+    """
+
+    read_gray: Callable[[int], GrayImage | None]
+    scales: Array
+    settings: AlignmentSettings
+    report: Callable[[int, int], None]
+    release: Callable[[], None]
+
+
+def open_image_sources(
+    paths: Sequence[Path],
+    sizes: Array,
+    detector_scales: Array,
+    finenesses: Sequence[float],
+    settings: AlignmentSettings,
+) -> list[ImageSource]:
+    """Sources of the images, each finer than the one before; nothing is read yet.
+
+    Parameters
+    ----------
+    paths : files of the images.
+    sizes : (N,2) their widths and heights in original pixels.
+    detector_scales : (N,) how many original pixels a detector pixel of each is wide.
+    finenesses : how much smaller than the detector's the pixels are, ascending; those that the images are
+        too small for are left out, all but the first.
+    settings : radius of the patches in pixels of the detector; the finer images have larger ones.
+    """
+    sources: list[ImageSource] = []
+    before = np.ones(len(paths))
+    for fineness in finenesses:
+        reductions = np.maximum(1.0, detector_scales / fineness)
+        gain = float(np.median(before / reductions)) if len(paths) else 1.0
+        if sources and gain < LEAST_GAIN:
+            break
+        finer = float(np.median(detector_scales / reductions)) if len(paths) else 1.0
+        patches = replace(settings, radius_px=round(settings.radius_px * finer**RADIUS_GROWTH))
+        sources.append(_open_source(paths, sizes, detector_scales, reductions, patches))
+        before = reductions
+    return sources
+
+
+def _open_source(
+    paths: Sequence[Path],
+    sizes: Array,
+    detector_scales: Array,
+    reductions: Array,
+    settings: AlignmentSettings,
+) -> ImageSource:
+    """The images scaled down by ``reductions`` (N,)."""
+    # not needed where keypoints are not refined
+    from snakesfm.ingest.read import read_image
+
+    shorter_sides = np.rint(sizes.min(axis=1) / reductions).astype(int).tolist()
+    pixels = float(np.median(sizes.prod(axis=1) / reductions**2)) if len(paths) else 1.0
+    # the images are worked on side by side
+    cv2.setNumThreads(1)
+
+    @lru_cache(maxsize=max(2 * settings.threads, int(HELD_PIXELS / pixels)))
+    def read_gray(row: int) -> GrayImage | None:
+        try:
+            image = read_image(paths[row], shorter_sides[row])
+        except ImageError as error:
+            print(f"warning: {error}")
+            return None
+        height, width = image.gray.shape
+        factor = min(1.0, shorter_sides[row] / min(height, width))
+        size = (max(1, round(width * factor)), max(1, round(height * factor)))
+        gray = image.gray if factor == 1.0 else cv2.resize(image.gray, size, interpolation=cv2.INTER_AREA)
+        scale = image.reduction * np.array([width, height]) / np.array(size)
+        return GrayImage(gray, scale / detector_scales[row])
+
+    return ImageSource(
+        read_gray,
+        reductions / detector_scales,
+        settings,
+        lambda aligned, count: print(f"keypoints refined: {aligned} of {count} observations", flush=True),
+        read_gray.cache_clear,
+    )

@@ -1,0 +1,73 @@
+"""What is refused before a scene's first job: paths that are not there, or whose files do not serve."""
+
+from pathlib import Path
+
+from snakesfm.config.configuration import STAGES
+from snakesfm.errors import ConfigError
+from snakesfm.ingest.discover import count_images
+from snakesfm.scene_plan import ScenePlan
+
+
+def check_scene(scene: ScenePlan) -> None:
+    """Refuse paths that are not there, or whose files do not serve.
+
+    Raises
+    ------
+    ConfigError : says which and what to do.
+    """
+    _check_images(scene)
+    _check_given_files(scene)
+    models = [model for stage in STAGES for model in scene.models(stage)]
+    if len(models) > 1 and scene.weights.is_file():
+        raise ConfigError(
+            f"weights={scene.weights} is one file, but scene '{scene.name}' needs those of "
+            f"{len(models)} networks ({', '.join(models)}): give a folder that holds them all."
+        )
+
+
+def _check_images(scene: ScenePlan) -> None:
+    images = scene.images
+    if not images.is_dir():
+        hint = "make it with 'make demo', or " if scene.inputs.images == "demo/images" else ""
+        raise ConfigError(
+            f"The image folder '{images}' does not exist: {hint}say which folder with "
+            "--config images=PATH (name a path with ' #' in it in a file for --configfile: "
+            "Snakemake cuts it there)."
+        )
+    if scene.folder.resolve().is_relative_to(images.resolve()):
+        raise ConfigError(
+            f"The output folder '{scene.folder.parent}' lies inside the image folder '{images}', so its "
+            "pictures would be taken for photographs: give another output=DIR."
+        )
+    if count_images(images, 1) == 0:
+        raise ConfigError(
+            f"The folder '{images}' holds no JPEG, PNG, TIFF, WebP or BMP image: "
+            "say with --config images=PATH which folder does."
+        )
+
+
+def _check_given_files(scene: ScenePlan) -> None:
+    if scene.configuration.select_pairs.method == "listed" and not scene.pairs_file:
+        raise ConfigError(
+            f"select_pairs.method is 'listed', but scene '{scene.name}' has no list: "
+            "give it with pairs=FILE."
+        )
+    methods = (scene.method("extract_features"), scene.method("match_pairs"))
+    oracle = next((name for name in methods if name in ("virtual", "virtual_places")), "")
+    if oracle and not scene.inputs.reference:
+        raise ConfigError(
+            f"The front-end '{oracle}' takes the points of a reference model, but scene '{scene.name}' "
+            "has none: give reference=PATH."
+        )
+    if scene.method("extract_features") == "imported" and not scene.inputs.imported:
+        raise ConfigError(
+            f"The front-end 'imported' reads hloc's files, but scene '{scene.name}' names none: "
+            "give imported=DIR."
+        )
+    for key in ("reference", "cameras", "pairs", "imported"):
+        path = getattr(scene.inputs, key)
+        if path and not Path(path).expanduser().exists():
+            raise ConfigError(
+                f"'{path}', given as {key}= for scene '{scene.name}', does not exist: "
+                "correct the path or remove the key."
+            )
