@@ -10,9 +10,9 @@ pytestmark = pytest.mark.e2e
 
 # front-end, least AUC of relative poses at 1, 3 and 5 degrees
 FRONT_ENDS = [
-    ("aliked+lightglue", (60.0, 85.0, 90.0)),
-    ("disk+lightglue", (60.0, 85.0, 90.0)),
-    ("xfeat+lighterglue", (55.0, 80.0, 88.0)),
+    ("aliked+lightglue", (80.0, 92.0, 95.0)),
+    ("disk+lightglue", (80.0, 92.0, 95.0)),
+    ("xfeat+lighterglue", (45.0, 75.0, 85.0)),
 ]
 
 
