@@ -1,7 +1,6 @@
 """One simulated scene through the workflow, and what its jobs needed."""
 
 import json
-import re
 import shutil
 import subprocess
 import sys
@@ -17,7 +16,6 @@ from benchmarks.job_logs import DONE
 from snakesfm.blocks import choose_blocks
 from snakesfm.simulate import Simulation, SimulationOptions
 
-PAIRS = re.compile(r"^(\d+) pairs", re.MULTILINE)
 TILED = ("match_pairs", "estimate_two_view")
 ACCURACY = ("relative_pose_auc_1deg", "relative_pose_auc_5deg", "position_error_percent_median")
 
@@ -112,25 +110,28 @@ def collect(options: SimulationOptions, folder: Path) -> Measurement:
         need = result.stages.setdefault(stage, StageNeed())
         artifact = scene / stage / f"{log.stem}.h5"
         if stage in TILED and artifact.is_file():
-            with h5py.File(artifact) as file:
-                need.pairs += len(file["pairs"])
+            need.pairs += _count_pairs(artifact)
         need.jobs += 1
         need.seconds += float(seconds)
         need.cpu += float(cpu)
         need.most_cpu = max(need.most_cpu, float(cpu))
         need.most_mb = max(need.most_mb, float(mb))
-    pairs = [folder / "pairs.txt"]
-    if pairs[0].is_file():
-        result.pairs = len(pairs[0].read_text("utf-8").splitlines())
-    elif (scene / "logs" / "select_pairs" / "job.log").is_file():
-        text = (scene / "logs" / "select_pairs" / "job.log").read_text("utf-8")
-        result.pairs = int(PAIRS.findall(text)[-1])
+    listed = folder / "pairs.txt"
+    if listed.is_file():
+        result.pairs = len(listed.read_text("utf-8").splitlines())
+    else:
+        result.pairs = sum(_count_pairs(path) for path in scene.glob("select_pairs/*.h5"))
     metrics = scene / "evaluate_model" / "metrics.json"
     if metrics.is_file():
         content = json.loads(metrics.read_text("utf-8"))
         result.registered = int(content["registered_images"])
         result.accuracy = {name: float(content[name]) for name in ACCURACY}
     return result
+
+
+def _count_pairs(artifact: Path) -> int:
+    with h5py.File(artifact) as file:
+        return len(file["pairs"])
 
 
 def save(measurements: list[Measurement], path: Path) -> None:

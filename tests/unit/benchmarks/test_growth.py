@@ -3,6 +3,8 @@
 import json
 from pathlib import Path
 
+import h5py
+import numpy as np
 import pytest
 
 from benchmarks.growth.measure import Measurement, StageNeed, collect, load, save
@@ -35,6 +37,13 @@ def test_the_last_run_of_a_job_counts(tmp_path: Path) -> None:
     save([found], tmp_path / "kept.json")
     assert load(tmp_path / "kept.json") == [found]
     assert load(tmp_path / "none.json") == []
+    # pairs that nobody listed are those that were chosen
+    (tmp_path / "pairs.txt").unlink()
+    (scene / "select_pairs").mkdir()
+    for name, count in (("0-0", 3), ("0-1", 0), ("1-1", 2)):
+        with h5py.File(scene / "select_pairs" / f"{name}.h5", "w") as file:
+            file["pairs"] = np.zeros((count, 2), np.int32)
+    assert collect(SimulationOptions(8, until="estimate_two_view"), tmp_path).pairs == 5
 
 
 @pytest.mark.parametrize("power", [1.0, 1.5, 2.0])
