@@ -34,6 +34,10 @@ from snakesfm.errors import ConfigError
             {"extract_features": {"surface_points": 5, "view_points": 5}},
             ["key 'extract_features': surface_points and view_points", "set one of them to 0."],
         ),
+        (
+            {"adjust_bundle": {"refine_finenesses": [2.0, 1.0]}},
+            ["key 'adjust_bundle': refine_finenesses must ascend"],
+        ),
     ],
 )
 def test_a_wrong_key_or_value_gives_one_sentence_that_names_it(values: dict, parts: list[str]) -> None:

@@ -1,8 +1,9 @@
 """Options of adjust_bundle."""
 
-from typing import Annotated, ClassVar, Literal
+from itertools import pairwise
+from typing import Annotated, ClassVar, Literal, Self
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from snakesfm.config.base import StageOptions
 
@@ -127,3 +128,9 @@ class AdjustBundleOptions(StageOptions):
 
     function_tolerance: float = Field(default=3e-6, gt=0.0)
     """Relative decrease of the cost at which the last pass ends; earlier ones end at 300 times as much."""
+
+    @model_validator(mode="after")
+    def _refine_in_ever_finer_images(self) -> Self:
+        if any(finer <= coarser for coarser, finer in pairwise(self.refine_finenesses)):
+            raise ValueError("refine_finenesses must ascend: each is for images finer than those before")
+        return self
