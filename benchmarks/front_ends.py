@@ -16,7 +16,8 @@ from benchmarks import ROOT
 from benchmarks.compare.measure import CommandError
 from benchmarks.compare.methods import snakesfm
 from benchmarks.compare.sets import ImageSet
-from benchmarks.on_sets import Run, SetTable, Value, finished, markdown_head, markdown_row
+from benchmarks.markdown import markdown_head, markdown_row
+from benchmarks.on_sets import Run, SetTable, Value, finished
 from snakesfm.evaluation.colmap_model import read_model
 from snakesfm.front_ends import FRONT_ENDS
 

@@ -110,13 +110,3 @@ def finished(values: Mapping[str, Value], name: str, method: str) -> bool:
     """Whether there is a result of a set and a method, and no failure."""
     value = values.get(f"{name}|{method}")
     return value is not None and "failure" not in value
-
-
-def markdown_row(cells: Sequence[str]) -> str:
-    """One row of a Markdown table."""
-    return f"| {' | '.join(cells)} |"
-
-
-def markdown_head(cells: Sequence[str]) -> list[str]:
-    """The first two rows of a Markdown table."""
-    return [markdown_row(cells), markdown_row(["---"] * len(cells))]

@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 from benchmarks import ROOT
 from benchmarks.compare.measure import CommandError, run_measured
 from benchmarks.compare.sets import ImageSet
-from benchmarks.on_sets import Run, SetTable, Value, finished, markdown_head, markdown_row
+from benchmarks.markdown import markdown_head, markdown_row
+from benchmarks.on_sets import Run, SetTable, Value, finished
 from snakesfm.artifacts import GlobalDescriptors, ImageIndex
 from snakesfm.config.select_pairs import SelectPairsOptions
 from snakesfm.evaluation.colmap_model import read_model

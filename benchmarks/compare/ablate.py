@@ -15,6 +15,7 @@ from benchmarks.compare.measure import CommandError
 from benchmarks.compare.methods import snakesfm
 from benchmarks.compare.run import source_digest
 from benchmarks.compare.sets import ImageSet
+from benchmarks.markdown import markdown_head, markdown_row
 from snakesfm.config.configuration import STAGES, load_configuration
 from snakesfm.errors import ConfigError
 
@@ -116,16 +117,14 @@ def render_ablations(
 
     ``areas`` maps 'set|option' to the AUC, None where there is no model, which counts as 0.
     """
+    titles = [f"{name}{'*' if is_truth else ''}" for name, is_truth in truth.items()]
     lines = [
         "# Ablations",
         "",
         f"Generated on {date} by `python -m benchmarks.compare ablate`; do not edit. Relative-pose AUC at 1 degree "
         "in per cent with one option changed; change: mean over the sets against the default. * marks surveyed truth.",
         "",
-        "| option | change | change on surveyed truth | "
-        + " | ".join(f"{name}{'*' if is_truth else ''}" for name, is_truth in truth.items())
-        + " |",
-        "|---|---|---|" + "---|" * len(truth),
+        *markdown_head(["option", "change", "change on surveyed truth", *titles]),
     ]
     for name in names:
         cells = [
@@ -135,7 +134,7 @@ def render_ablations(
         for image_set in truth:
             value = areas.get(f"{image_set}|{name}", 0.0)
             cells.append("failed" if value is None else f"{value:.2f}")
-        lines.append(f"| {name} | " + " | ".join(cells) + " |")
+        lines.append(markdown_row([name, *cells]))
     return "\n".join(lines) + "\n"
 
 

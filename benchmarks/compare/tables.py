@@ -37,6 +37,7 @@ from benchmarks.compare.summary import (
     spread,
     tally,
 )
+from benchmarks.markdown import markdown_head, markdown_row
 
 TITLES = {OWN: "(a) own front-end", SAME: "(b) same features and two-view geometries"}
 AREAS = tuple(f"relative_pose_auc_{degrees}deg" for degrees in (1, 3, 5))
@@ -158,8 +159,8 @@ def _summary(sets: Mapping[str, Result], groups: Mapping[Key, list[Result]]) -> 
         "were made by COLMAP's incremental mapper: there its rows show how well it repeats itself.",
         "",
     ]
-    lines.append("| set | (a) AUC@1 | @3 | @5 | registered | (b) AUC@1 | @3 | @5 | registered |")
-    lines.append("|---|" + "---|" * 8)
+    measures = ("@3", "@5", "registered")
+    lines += markdown_head(["set", "(a) AUC@1", *measures, "(b) AUC@1", *measures])
     for name, result in sets.items():
         cells = [f"{name}{'*' if result.truth else ''}"]
         for setting in SETTINGS:
@@ -167,21 +168,20 @@ def _summary(sets: Mapping[str, Result], groups: Mapping[Key, list[Result]]) -> 
                 difference = gap(key, groups, name, setting)
                 digits = 0 if key == "registered_images" else 2
                 cells.append("" if difference is None else f"{difference:+.{digits}f}")
-        lines.append("| " + " | ".join(cells) + " |")
+        lines.append(markdown_row(cells))
     lines += ["", *_tallies(sets, groups), ""]
     lines += [
         "How many times faster snakesfm is, in wall clock (where both or neither were disturbed) and in processor time.",
         "",
     ]
     titles = [f"{SHORT[setting]} vs {method} ({kind})" for setting, _, kind, method in SPEEDS]
-    lines.append("| set | images | " + " | ".join(titles) + " |")
-    lines.append("|---|---|" + "---|" * len(SPEEDS))
+    lines += markdown_head(["set", "images", *titles])
     for name, result in sets.items():
         cells = [name, str(result.images)]
         for setting, key, _, method in SPEEDS:
             found = speed(key, groups, name, setting, method)
             cells.append("" if found is None else f"{'~' if found[1] else ''}{found[0]:.1f}x")
-        lines.append("| " + " | ".join(cells) + " |")
+        lines.append(markdown_row(cells))
     return lines
 
 
@@ -213,20 +213,18 @@ def _table(
     used = [k for k in range(len(columns)) if any(cells[k] is not None for cells in spreads.values())]
     if not used:
         return []
-    lines = ["", TITLES[setting], ""]
-    lines.append("| method | " + " | ".join(columns[k].title for k in used) + " |")
-    lines.append("|---|" + "---|" * len(used))
+    lines = ["", TITLES[setting], "", *markdown_head(["method", *(columns[k].title for k in used)])]
     failures = []
     for method, runs in rows:
         failed = [run.failure for run in runs if run.failure]
         if failed:
             failures.append(f"{method}: {len(failed)} of {len(runs)} runs without a model ({failed[0]}).")
         cells = [_cell(columns[k], spreads[method][k]) for k in used]
-        lines.append(f"| {method} | " + " | ".join(cells) + " |")
+        lines.append(markdown_row([method, *cells]))
     if any(method == OURS for method, _ in rows) and len(rows) > 1:
         found = ratios(groups, name, setting)
         cells = ["" if (value := found[columns[k].key]) is None else f"{value:.3g}" for k in used]
-        lines.append("| *ratio* | " + " | ".join(cells) + " |")
+        lines.append(markdown_row(["*ratio*", *cells]))
     return lines + (["", *failures] if failures and columns is ACCURACY else [])
 
 

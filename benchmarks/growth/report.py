@@ -10,6 +10,7 @@ from importlib.metadata import version
 from pathlib import Path
 
 from benchmarks.growth.measure import TILED, Measurement
+from benchmarks.markdown import markdown_head, markdown_row
 from snakesfm.blocks import choose_blocks
 from snakesfm.resources import NEEDS, job_load, memory_mb
 
@@ -44,8 +45,7 @@ def write_report(measurements: Sequence[Measurement], path: Path, command: str) 
 
 
 def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    lines = [f"| {' | '.join(head)} |", f"|{'---|' * len(head)}"]
-    return "\n".join(lines + [f"| {' | '.join(row)} |" for row in rows])
+    return "\n".join([*markdown_head(head), *map(markdown_row, rows)])
 
 
 def _head(command: str) -> str:
