@@ -110,7 +110,15 @@ def run(job: StageJob) -> None:
             ("View graph", ["filter", "edges"], label_counts(graph.labels, EDGE_LABELS)),
             (
                 "Bundle adjustment",
-                ["round", "images", "points", "observations", "cost before", "cost after", "mean error px"],
+                [
+                    "round",
+                    "images",
+                    "points",
+                    "observations",
+                    "cost before",
+                    "cost after",
+                    "mean error, detector px",
+                ],
                 bundle_rows(
                     model.round_names, model.round_counts, model.round_costs, model.round_errors_px
                 ),
