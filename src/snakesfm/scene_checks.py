@@ -4,7 +4,8 @@ from pathlib import Path
 
 from snakesfm.config.configuration import STAGES
 from snakesfm.errors import ConfigError
-from snakesfm.ingest.discover import count_images
+from snakesfm.ingest.discover import count_images, list_images
+from snakesfm.ingest.masks import find_masks
 from snakesfm.scene_plan import ScenePlan
 
 
@@ -17,6 +18,8 @@ def check_scene(scene: ScenePlan) -> None:
     """
     _check_images(scene)
     _check_given_files(scene)
+    if scene.inputs.masks:
+        _check_masks(scene)
     models = [model for stage in STAGES for model in scene.models(stage)]
     if len(models) > 1 and scene.weights.is_file():
         raise ConfigError(
@@ -64,10 +67,33 @@ def _check_given_files(scene: ScenePlan) -> None:
             f"The front-end 'imported' reads hloc's files, but scene '{scene.name}' names none: "
             "give imported=DIR."
         )
-    for key in ("reference", "cameras", "pairs", "imported"):
+    for key in ("reference", "cameras", "masks", "pairs", "imported"):
         path = getattr(scene.inputs, key)
         if path and not Path(path).expanduser().exists():
             raise ConfigError(
                 f"'{path}', given as {key}= for scene '{scene.name}', does not exist: "
                 "correct the path or remove the key."
             )
+
+
+def _check_masks(scene: ScenePlan) -> None:
+    masks = scene.masks
+    if not masks.is_dir():
+        raise ConfigError(
+            f"'{masks}', given as masks=, is no folder: give the folder that holds the masks."
+        )
+    if masks.resolve().is_relative_to(scene.images.resolve()):
+        raise ConfigError(
+            f"The folder of masks '{masks}' lies inside the image folder '{scene.images}', so its files "
+            "would be taken for photographs: move it elsewhere."
+        )
+    if scene.method("extract_features") == "imported" or scene.detector_free:
+        raise ConfigError(
+            f"Scene '{scene.name}' has masks, but they do not reach matches that are imported or found "
+            "without keypoints: remove masks= or take another front_end."
+        )
+    if not find_masks(masks, list_images(scene.images)):
+        raise ConfigError(
+            f"The folder of masks '{masks}' holds none for any image of scene '{scene.name}': the mask of "
+            "'a/b.jpg' is 'a/b.jpg.png' or 'a/b.png' in it."
+        )

@@ -72,6 +72,11 @@ class ScenePlan:
         """The image folder."""
         return Path(self.inputs.images).expanduser()
 
+    @property
+    def masks(self) -> Path:
+        """The folder of masks, where one is given."""
+        return Path(self.inputs.masks).expanduser()
+
     @functools.cached_property
     def image_count(self) -> int:
         """Number of files that look like images."""
@@ -148,6 +153,13 @@ class ScenePlan:
             name = "features.h5" if stage == "extract_features" else "matches.h5"
             return {"imported": str(folder), "source_content": file_state(folder / name)}
         return {}
+
+    def mask_settings(self, main_process: bool) -> dict[str, str]:
+        """What a stage is told of the masks; nothing where there are none."""
+        if not self.inputs.masks:
+            return {}
+        # as with images, only the controller reads them to see whether they changed
+        return {"masks": str(self.masks), "masks_content": self._mask_fingerprint if main_process else ""}
 
     def weight_settings(self, stage: str, main_process: bool) -> dict[str, Any]:
         """What a stage is told of its networks' weights; nothing where it has none."""
@@ -283,6 +295,10 @@ class ScenePlan:
     def _fingerprint(self) -> str:
         return fingerprint_images(self.images, self.folder / "index_images" / "digests.json")
 
+    @functools.cached_property
+    def _mask_fingerprint(self) -> str:
+        return fingerprint_images(self.masks, self.folder / "index_images" / "mask_digests.json")
+
     def settings(self, stage: str, wildcards: Mapping[str, str], main_process: bool) -> dict[str, Any]:
         """What a stage is told beside its options."""
         inputs = self.inputs
@@ -298,6 +314,7 @@ class ScenePlan:
             }
         if stage == "extract_features":
             settings = {"images": str(self.images), "block": int(wildcards["block"])}
+            settings |= self.mask_settings(main_process)
             return settings | self.weight_settings(stage, main_process) | self.source_settings(stage)
         if stage == "match_pairs":
             learned = self.weight_settings(stage, main_process)

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from snakesfm.config.configuration import FrontEndName, options_class
+from snakesfm.config.configuration import STAGES, FrontEndName, options_class
 from snakesfm.errors import ConfigError
 from snakesfm.features.extraction import DETECTORS
 from snakesfm.front_ends import (
@@ -173,6 +173,45 @@ def test_stages_after_matching_are_told_how_large_the_detector_saw_the_images(
     for stage in ("merge_keypoints", *STAGES_IN_DETECTOR_PIXELS, "adjust_bundle"):
         told = json.loads(scene.params(stage, {"block": "0", "tile": "0-0"}, True))["settings"]
         assert {name: value for name, value in told.items() if name.startswith("detector_")} == expected
+
+
+def test_masks_reach_extraction_alone_and_their_content_counts(tmp_path: Path) -> None:
+    masks = tmp_path / "masks"
+    masks.mkdir()
+    (masks / "1.jpg.png").write_bytes(b"mask")
+    (before,) = plan_of(tmp_path).scenes.values()
+    (scene,) = plan_of(tmp_path, masks=str(masks)).scenes.values()
+    wildcards = {"block": "0", "tile": "0-0"}
+    for stage in STAGES:
+        same = scene.params(stage, wildcards, True) == before.params(stage, wildcards, True)
+        assert same == (stage != "extract_features")
+    (masks / "1.jpg.png").write_bytes(b"another mask")
+    (changed,) = plan_of(tmp_path, masks=str(masks)).scenes.values()
+    told = [plan.settings("extract_features", wildcards, True) for plan in (scene, changed)]
+    assert told[0]["masks"] == told[1]["masks"] and told[0]["masks_content"] != told[1]["masks_content"]
+
+
+@pytest.mark.parametrize(
+    ("masks", "config", "reason"),
+    [
+        ("none", {}, "does not exist"),
+        ("scene/images", {}, "lies inside the image folder"),
+        ("empty", {}, r"holds none for any image of scene 'scene'.*a/b\.jpg\.png"),
+        ("file", {}, "is no folder"),
+        ("masks", {"front_end": "loftr"}, "take another front_end"),
+        ("masks", {"front_end": "imported"}, "take another front_end"),
+    ],
+)
+def test_masks_that_would_do_nothing_are_refused(
+    masks: str, config: dict[str, Any], reason: str, tmp_path: Path
+) -> None:
+    for folder in ("masks", "empty"):
+        (tmp_path / folder).mkdir()
+    (tmp_path / "masks" / "1.png").write_bytes(b"mask")
+    (tmp_path / "file").write_bytes(b"mask")
+    here = str(tmp_path)
+    with pytest.raises(ConfigError, match=reason):
+        plan_of(tmp_path, masks=str(tmp_path / masks), weights=here, imported=here, **config)
 
 
 def test_networks_that_describe_images_need_no_keypoints_and_no_vocabulary(tmp_path: Path) -> None:

@@ -6,6 +6,7 @@ import shutil
 import signal
 from pathlib import Path
 
+import cv2
 import h5py
 import numpy as np
 import pycolmap
@@ -14,7 +15,7 @@ from workflow_runner import copy_run, model_bytes
 
 from benchmarks.compare.measure import Cost
 from benchmarks.compare.methods import stage_costs
-from snakesfm.artifacts import Reconstruction
+from snakesfm.artifacts import LocalFeatures, Reconstruction
 from snakesfm.config.configuration import STAGES
 
 MAPPING = [
@@ -112,6 +113,29 @@ def test_an_option_reaches_its_stage_and_what_follows_alone(finished, small_scen
     copy_run(finished[0], workflow.folder)
     outcome = workflow.run("--dry-run", *config_of(small_scene), "adjust_bundle={max_iterations: 77}")
     assert sorted(set(outcome.rules)) == sorted(MAPPING[6:])
+
+
+def test_masked_parts_of_images_take_no_part(finished, small_scene: Path, workflow) -> None:
+    copy_run(finished[0], workflow.folder)
+    masks = workflow.folder / "masks"
+    masks.mkdir()
+    names = sorted(path.name for path in (small_scene / "images").iterdir())
+    for name in names[:-1]:
+        mask = np.full((300, 400), 255, np.uint8)
+        mask[:, 200:] = 0
+        cv2.imwrite(str(masks / f"{name}.png"), mask)
+    outcome = workflow.run(*config_of(small_scene), "masks=masks")
+    assert outcome.status == 0, outcome.text
+    assert "index_images" not in outcome.rules and "extract_features" in outcome.rules
+    for path in (workflow.folder / "out" / "square" / "extract_features").glob("*.h5"):
+        features = LocalFeatures.read(path)
+        for row, name in enumerate(features.names):
+            x = features.keypoints[features.offsets[row] : features.offsets[row + 1], 0]
+            assert len(x) > 20 and (x.max() < 200) == (name != names[-1])
+    log = (workflow.folder / "out" / "square" / "logs" / "extract_features" / "0.log").read_text()
+    assert re.search(r"(\d+) images \(\d taken over\), \d+ of them with masks", log)
+    again = workflow.run(*config_of(small_scene), "masks=masks")
+    assert again.status == 0 and again.rules == [], again.text
 
 
 def test_a_folder_without_records_is_taken_over_unless_its_options_differ(

@@ -62,6 +62,8 @@ class SceneInputs(BaseModel):
     """Known intrinsics: a COLMAP cameras.txt (or its folder) or a 3x3 K.txt; empty for none."""
     intrinsics: Literal["fixed", "refine"] = "fixed"
     """What bundle adjustment does with known intrinsics: keep them fixed, or refine them."""
+    masks: str = ""
+    """Folder of masks, black where no keypoints are wanted: 'a/b.jpg.png' for 'a/b.jpg'; empty for none."""
     pairs: str = ""
     """File of image pairs, one 'name0 name1' a line, for select_pairs.method 'listed'; empty for none."""
     imported: str = ""
@@ -100,6 +102,8 @@ class RunOptions(BaseModel):
     """Known intrinsics: a COLMAP cameras.txt (or its folder) or a 3x3 K.txt; empty for none."""
     intrinsics: Literal["fixed", "refine"] = "fixed"
     """What bundle adjustment does with known intrinsics: keep them fixed, or refine them."""
+    masks: str = ""
+    """Folder of masks, black where no keypoints are wanted: 'a/b.jpg.png' for 'a/b.jpg'; empty for none."""
     pairs: str = ""
     """File of image pairs, one 'name0 name1' a line, for select_pairs.method 'listed'; empty for none."""
     imported: str = ""
@@ -113,7 +117,7 @@ class RunOptions(BaseModel):
     batch_size: Annotated[int, Field(ge=1, le=256)] | Literal["auto"] = "auto"
     """Images or pairs that a network gets at once; 'auto': 1 on the processor, 4 on CUDA."""
     scenes: dict[str, SceneInputs] = Field(default_factory=dict)
-    """Several scenes: a mapping from name to images, reference, cameras, intrinsics and pairs."""
+    """Several scenes: a mapping from name to images, reference, cameras, intrinsics, masks and pairs."""
     seed: int = Field(default=0, ge=0)
     """Seed of every random draw; the same seed gives the same model."""
     blocks: Annotated[int, Field(ge=1)] | Literal["auto"] = "auto"
@@ -130,6 +134,7 @@ class RunOptions(BaseModel):
                 "scene",
                 "reference",
                 "cameras",
+                "masks",
                 "pairs",
                 "imported",
                 "weights",

@@ -1,6 +1,7 @@
 """From an image to its strongest keypoints."""
 
 import importlib
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
@@ -11,8 +12,12 @@ from numpy.typing import NDArray
 
 from snakesfm.features.keypoints import BatchDetector, Detector, KeypointSet
 from snakesfm.features.sift import SiftDetector
+from snakesfm.ingest.masks import select_unmasked
 
 Array = NDArray[Any]
+
+# of masks that leave less of an image, fewer keypoints than wanted may be found
+SMALLEST_SHARE = 0.25
 
 
 def _learned(name: str) -> Callable[..., Detector]:
@@ -45,6 +50,7 @@ def extract_keypoints(
     images: Sequence[tuple[Array, Array]],
     max_keypoints: int,
     max_shorter_side_px: int,
+    masks: Sequence[Array | None] = (),
 ) -> list[KeypointSet]:
     """Find the strongest keypoints of images.
 
@@ -54,6 +60,7 @@ def extract_keypoints(
     images : gray (H,W) and rgb (H,W,3) uint8 of each, whose pixels are those of the result.
     max_keypoints : most keypoints returned of each.
     max_shorter_side_px : larger images are scaled down to this before detection.
+    masks : of each image where keypoints are wanted, (H,W) bool of any size, or None for everywhere.
 
     Returns
     -------
@@ -61,14 +68,33 @@ def extract_keypoints(
     place, scale and angle, so the order depends on the image alone.
     """
     small = [_shrink(gray, rgb, max_shorter_side_px) for gray, rgb in images]
+    masks = masks or [None] * len(images)
+    counts = [_count_before_mask(max_keypoints, mask) for mask in masks]
     if isinstance(detector, BatchDetector):
-        found = detector.detect_batch(small, max_keypoints)
+        found = detector.detect_batch(small, max(counts, default=max_keypoints))
     else:
-        found = [detector.detect(gray, rgb, max_keypoints) for gray, rgb in small]
+        found = [
+            detector.detect(gray, rgb, count) for (gray, rgb), count in zip(small, counts, strict=True)
+        ]
+    found = [
+        points if mask is None else _unmasked(points, mask, seen[0].shape)
+        for points, mask, seen in zip(found, masks, small, strict=True)
+    ]
     return [
         _strongest(points, max_keypoints, seen[0].shape, original[0].shape)
         for points, seen, original in zip(found, small, images, strict=True)
     ]
+
+
+def _count_before_mask(count: int, mask: Array | None) -> int:
+    """How many keypoints are looked for where so many are wanted of a part of the image."""
+    share = 1.0 if mask is None else float(mask.mean())
+    return math.ceil(count / max(share, SMALLEST_SHARE))
+
+
+def _unmasked(points: KeypointSet, mask: Array, shape: tuple[int, ...]) -> KeypointSet:
+    """The keypoints in an image (H,W) that lie where the mask wants them."""
+    return points.take(np.flatnonzero(select_unmasked(mask, points.keypoints, shape[1], shape[0])))
 
 
 def _strongest(

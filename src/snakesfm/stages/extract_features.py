@@ -13,9 +13,11 @@ from numpy.typing import NDArray
 from snakesfm.artifacts.features import LocalFeatures
 from snakesfm.artifacts.hloc import FEATURES, descriptor_size, open_hloc, read_hloc_features
 from snakesfm.artifacts.images import ImageIndex
+from snakesfm.digests import file_digest
 from snakesfm.errors import ImageError
 from snakesfm.features.extraction import create_detector, extract_keypoints, sample_colors
 from snakesfm.features.keypoints import Detector, KeypointSet, KeypointSource
+from snakesfm.ingest.masks import find_masks, read_mask, select_unmasked
 from snakesfm.ingest.read import read_image
 from snakesfm.learned.batches import in_batches
 from snakesfm.stages.job import StageJob
@@ -49,7 +51,13 @@ def run(job: StageJob) -> None:
     folder = Path(job.settings["images"])
     finder = _create_finder(job, options)
     beside = job.weights_digest() + str(job.settings.get("source_content", ""))
-    digests = [_digest(str(index.sha256[row]), options, beside) for row in rows]
+    names = [str(name) for name in index.names[rows]]
+    masks = find_masks(Path(job.settings["masks"]), names) if job.settings.get("masks") else {}
+    contents = {name: file_digest(str(path)) for name, path in masks.items()}
+    digests = [
+        _digest(str(sha256), options, beside + contents.get(name, ""))
+        for sha256, name in zip(index.sha256[rows], names, strict=True)
+    ]
     former = job.take_over(digests, _read_former)
     progress = job.progress(len(rows), "images")
     results = {place: former[digest] for place, digest in enumerate(digests) if digest in former}
@@ -58,15 +66,17 @@ def run(job: StageJob) -> None:
     sizes = [(width, height) for width, height in index.sizes[rows].tolist()]
     for batch in in_batches([sizes[place] for place in missing], job.network_batch()):
         places = [missing[part] for part in batch]
-        images = [(str(index.names[rows[place]]), sizes[place]) for place in places]
-        results |= zip(places, _extract(folder, images, finder, options), strict=True)
+        images = [(names[place], sizes[place]) for place in places]
+        wanted = [read_mask(masks[name], size) if name in masks else None for name, size in images]
+        results |= zip(places, _extract(folder, images, wanted, finder, options), strict=True)
         progress.step(len(places))
     ordered = [results[place] for place in range(len(rows))]
     _collect(index, rows, digests, ordered, finder).write(job.output, job.header)
     counts = [len(result.points) for result in ordered]
     reused = sum(digest in former for digest in digests)
+    masked = f", {len(masks)} of them with masks" if masks else ""
     print(
-        f"{len(rows)} images ({reused} taken over), {sum(counts)} keypoints, "
+        f"{len(rows)} images ({reused} taken over){masked}, {sum(counts)} keypoints, "
         f"median {int(np.median(counts)) if counts else 0} per image"
     )
 
@@ -130,10 +140,11 @@ def _digest(sha256: str, options: "ExtractFeaturesOptions", beside: str) -> str:
 def _extract(
     folder: Path,
     images: Sequence[tuple[str, tuple[int, int]]],
+    masks: Sequence[Array | None],
     finder: Detector | KeypointSource,
     options: "ExtractFeaturesOptions",
 ) -> list[ColoredKeypoints]:
-    """The keypoints of images, each given by its name in the folder and its width and height."""
+    """The keypoints of images, each given by its name in the folder, its width and height, and its mask."""
     nothing = KeypointSet.empty(finder.descriptor_size, finder.descriptor_dtype)
     results = [ColoredKeypoints(nothing, np.zeros((0, 3), np.uint8))] * len(images)
     pixels = {}
@@ -144,12 +155,13 @@ def _extract(
             print(f"warning: {error}")
     most = finder.usual_keypoints if options.max_keypoints == "auto" else options.max_keypoints
     if isinstance(finder, KeypointSource):
-        found = [finder.read(*images[place]) for place in pixels]
+        found = [_read_known(finder, *images[place], masks[place]) for place in pixels]
         if options.method == "virtual":
             found = [points.take(np.argsort(-points.scores, kind="stable")[:most]) for points in found]
     else:
         seen = [(image.gray, image.rgb) for image in pixels.values()]
-        reduced = extract_keypoints(finder, seen, most, options.max_shorter_side_px)
+        wanted = [masks[place] for place in pixels]
+        reduced = extract_keypoints(finder, seen, most, options.max_shorter_side_px, wanted)
         found = [
             points.scaled(image.reduction, image.reduction)
             for points, image in zip(reduced, pixels.values(), strict=True)
@@ -158,6 +170,18 @@ def _extract(
         colors = sample_colors(image.rgb, points.keypoints / image.reduction)
         results[place] = ColoredKeypoints(points, colors)
     return results
+
+
+def _read_known(
+    source: KeypointSource, name: str, size: tuple[int, int], mask: Array | None
+) -> KeypointSet:
+    """The known keypoints of an image, but for those that its mask hides."""
+    points = source.read(name, size)
+    return (
+        points
+        if mask is None
+        else points.take(np.flatnonzero(select_unmasked(mask, points.keypoints, *size)))
+    )
 
 
 def _read_former(path: Path, wanted: set[str]) -> Mapping[str, ColoredKeypoints]:

@@ -106,7 +106,7 @@ class Scene:
     def tile_files(self, stage):
         return [self.file(f"{stage}/{a}-{b}") for a in range(self.blocks) for b in range(a, self.blocks)]
 
-    def extract(self, options=None, former=None):
+    def extract(self, options=None, former=None, **settings):
         for block, output in enumerate(self.block_files("features")):
             inputs = {"index": self.file("index")}
             extract_features.run(
@@ -118,6 +118,7 @@ class Scene:
                     former and former.block_files("features")[block],
                     images=str(self.images),
                     block=block,
+                    **settings,
                 )
             )
 
@@ -392,3 +393,45 @@ def test_an_empty_scene_gives_valid_files(tmp_path, images):
         )
     )
     assert len(GlobalDescriptors.read(scene.file("d")).image_ids) == 0
+
+
+def test_keypoints_are_found_where_masks_want_them(images, tmp_path):
+    masks = tmp_path / "masks"
+    (masks / "a").mkdir(parents=True)
+    # the left quarter, in a mask of half the image's size
+    quarter = np.zeros((120, 160), np.uint8)
+    quarter[:, :40] = 255
+    cv2.imwrite(str(masks / "a" / "1 #{x}.png.png"), quarter)
+    cv2.imwrite(str(masks / "other.png"), np.zeros((240, 320), np.uint8))
+    cv2.imwrite(str(masks / "flat.png.png"), np.full((240, 320), 255, np.uint8))
+    found, keypoints = {}, {}
+    options = ExtractFeaturesOptions(max_keypoints=60)
+    for name, settings in (("all", {}), ("masked", {"masks": str(masks)})):
+        (tmp_path / name).mkdir()
+        scene = Scene(tmp_path / name, images, 1)
+        scene.extract(options, **settings)
+        found[name] = LocalFeatures.read(scene.block_files("features")[0])
+        keypoints[name] = np.split(found[name].keypoints, found[name].offsets[1:-1])
+    left, hidden = NAMES.index("a/1 #{x}.png"), NAMES.index("other.png")
+    assert keypoints["all"][left][:, 0].max() > 200
+    assert 40 < keypoints["masked"][left][:, 0].max() < 80
+    # as many as are wanted are found in the part that is left
+    assert len(keypoints["masked"][left]) == len(keypoints["all"][left]) == 60
+    assert len(keypoints["masked"][hidden]) == 0 < len(keypoints["all"][hidden])
+    for name in ("b/ü 2.png", "shifted.png"):
+        row = NAMES.index(name)
+        np.testing.assert_array_equal(keypoints["masked"][row], keypoints["all"][row])
+    changed = found["masked"].digests != found["all"].digests
+    assert {NAMES[row] for row in np.flatnonzero(changed)} == {"a/1 #{x}.png", "other.png", "flat.png"}
+
+
+def test_a_mask_of_another_shape_is_refused(images, tmp_path):
+    masks = tmp_path / "masks"
+    masks.mkdir()
+    cv2.imwrite(str(masks / "other.png.png"), np.zeros((320, 240), np.uint8))
+    scene = Scene(tmp_path, images, 1)
+    with pytest.raises(ConfigError, match=r"other\.png\.png has 240 x 320 pixels but its image 320 x 240"):
+        scene.extract(masks=str(masks))
+    (masks / "other.png.png").write_bytes(b"\x89PNG no image")
+    with pytest.raises(ConfigError, match=r"A mask cannot be used: .*other\.png\.png"):
+        scene.extract(masks=str(masks))
