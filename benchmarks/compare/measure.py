@@ -79,7 +79,8 @@ def run_measured(command: list[str], folder: Path, log: Path, limit_s: float) ->
             stdout=stream,
             stderr=subprocess.STDOUT,
             start_new_session=True,
-            env={**os.environ, "PYTHONPATH": str(ROOT)},
+            # the sources beside this file are measured, whichever are installed
+            env={**os.environ, "PYTHONPATH": os.pathsep.join((str(ROOT / "src"), str(ROOT)))},
         )
         try:
             while True:
