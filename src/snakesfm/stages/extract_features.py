@@ -43,6 +43,10 @@ def run(job: StageJob) -> None:
     """Read the block's images, as many at a time as a network gets at once, and write their LocalFeatures.
 
     An image that cannot be decoded gets no keypoints and a warning; the others go on.
+
+    Raises
+    ------
+    ConfigError : a mask cannot be read, or does not show the whole of its image.
     """
     cv2.setNumThreads(job.threads)
     options: ExtractFeaturesOptions = job.options
