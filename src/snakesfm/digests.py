@@ -9,7 +9,18 @@ from typing import Any
 
 # where things are, and what only the controller reads
 UNTOLD = frozenset(
-    ("images", "cameras", "pairs_file", "reference", "imported", "weights", "fetch", "weights_content")
+    (
+        "images",
+        "cameras",
+        "masks",
+        "masks_content",
+        "pairs_file",
+        "reference",
+        "imported",
+        "weights",
+        "fetch",
+        "weights_content",
+    )
 )
 
 

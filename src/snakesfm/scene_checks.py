@@ -4,8 +4,8 @@ from pathlib import Path
 
 from snakesfm.config.configuration import STAGES
 from snakesfm.errors import ConfigError
-from snakesfm.ingest.discover import count_images, list_images
-from snakesfm.ingest.masks import find_masks
+from snakesfm.ingest.discover import count_images, walk_images
+from snakesfm.ingest.masks import find_mask
 from snakesfm.scene_plan import ScenePlan
 
 
@@ -92,7 +92,8 @@ def _check_masks(scene: ScenePlan) -> None:
             f"Scene '{scene.name}' has masks, but they do not reach matches that are imported or found "
             "without keypoints: remove masks= or take another front_end."
         )
-    if not find_masks(masks, list_images(scene.images)):
+    # every job comes by here: with a mask for each image, the first one is enough
+    if not any(find_mask(masks, image) for image in walk_images(scene.images)):
         raise ConfigError(
             f"The folder of masks '{masks}' holds none for any image of scene '{scene.name}': the mask of "
             "'a/b.jpg' is 'a/b.jpg.png' or 'a/b.png' in it."

@@ -41,11 +41,13 @@ SCENE_ARTIFACTS = (
 )
 
 STAGES_IN_DETECTOR_PIXELS = (
+    "merge_keypoints",
     "index_matches",
     "calibrate_cameras",
     "estimate_two_view",
     "build_tracks",
     "triangulate_tracks",
+    "adjust_bundle",
 )
 STAGES_WITH_NETWORKS = ("extract_features", "describe_images", "match_pairs")
 
@@ -154,12 +156,13 @@ class ScenePlan:
             return {"imported": str(folder), "source_content": file_state(folder / name)}
         return {}
 
-    def mask_settings(self, main_process: bool) -> dict[str, str]:
+    def mask_settings(self, main_process: bool) -> dict[str, Any]:
         """What a stage is told of the masks; nothing where there are none."""
         if not self.inputs.masks:
             return {}
         # as with images, only the controller reads them to see whether they changed
-        return {"masks": str(self.masks), "masks_content": self._mask_fingerprint if main_process else ""}
+        content = self._mask_fingerprint if main_process else ""
+        return {"masked": True, "masks": str(self.masks), "masks_content": content}
 
     def weight_settings(self, stage: str, main_process: bool) -> dict[str, Any]:
         """What a stage is told of its networks' weights; nothing where it has none."""
@@ -188,9 +191,8 @@ class ScenePlan:
     @property
     def detector_pixels(self) -> dict[str, int]:
         """To which size images are scaled down for the detector; nothing where points are projected."""
-        if self.method("extract_features" if not self.detector_free else "match_pairs").startswith(
-            "virtual"
-        ):
+        finder = self.method("match_pairs" if self.detector_free else "extract_features")
+        if finder.startswith("virtual"):
             return {}
         if self.detector_free:
             return {LONGER_SIDE: self.configuration.match_pairs.longer_side_px}
@@ -301,6 +303,10 @@ class ScenePlan:
 
     def settings(self, stage: str, wildcards: Mapping[str, str], main_process: bool) -> dict[str, Any]:
         """What a stage is told beside its options."""
+        pixels = self.detector_pixels if stage in STAGES_IN_DETECTOR_PIXELS else {}
+        return self._own_settings(stage, wildcards, main_process) | pixels
+
+    def _own_settings(self, stage: str, wildcards: Mapping[str, str], main_process: bool) -> dict[str, Any]:
         inputs = self.inputs
         if stage == "index_images":
             # only the controller compares params, so only it reads the images to see whether they changed
@@ -326,8 +332,7 @@ class ScenePlan:
             settings = {"images": str(self.images), "block": int(wildcards["block"])}
             return settings | self.weight_settings(stage, main_process)
         if stage == "merge_keypoints":
-            settings = {"images": str(self.images), "block": int(wildcards["block"])}
-            return settings | self.detector_pixels
+            return {"images": str(self.images), "block": int(wildcards["block"])}
         if stage == "select_pairs":
             return {
                 "blocks": self.blocks,
@@ -335,10 +340,7 @@ class ScenePlan:
                 "pairs_content": file_digest(self.pairs_file),
             }
         if stage == "adjust_bundle":
-            settings = {"images": str(self.images), "intrinsics": inputs.intrinsics}
-            return settings | self.detector_pixels
-        if stage in STAGES_IN_DETECTOR_PIXELS:
-            return dict(self.detector_pixels)
+            return {"images": str(self.images), "intrinsics": inputs.intrinsics}
         if stage == "export_model":
             return {"images": str(self.images)}
         if stage == "evaluate_model":

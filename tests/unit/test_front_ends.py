@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 
 from snakesfm.config.configuration import STAGES, FrontEndName, options_class
+from snakesfm.digests import settings_text
 from snakesfm.errors import ConfigError
 from snakesfm.features.extraction import DETECTORS
 from snakesfm.front_ends import (
@@ -189,6 +190,10 @@ def test_masks_reach_extraction_alone_and_their_content_counts(tmp_path: Path) -
     (changed,) = plan_of(tmp_path, masks=str(masks)).scenes.values()
     told = [plan.settings("extract_features", wildcards, True) for plan in (scene, changed)]
     assert told[0]["masks"] == told[1]["masks"] and told[0]["masks_content"] != told[1]["masks_content"]
+    # a job on a cluster is not told the content, and its artifact must be known again all the same
+    job = scene.settings("extract_features", wildcards, False)
+    assert settings_text(job, 0) == scene.settings_text("extract_features", Path("0.h5"))
+    assert settings_text(job, 0) != before.settings_text("extract_features", Path("0.h5"))
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,6 @@
 """Columns of artifacts that are spread over the files of all blocks or tiles."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -40,6 +40,28 @@ def gather_image_columns(paths: Sequence[Path], count: int, *columns: str) -> li
         shape, dtype = next(((v.shape[1:], v.dtype) for v in values if v.size), ((2,), np.dtype("f4")))
         values[:] = [v if v.size else np.zeros((0, *shape), dtype) for v in values]
     return gathered
+
+
+def gather_keypoints(
+    paths: Iterable[Path], images: Collection[int]
+) -> tuple[dict[int, Array], dict[int, str]]:
+    """Keypoints (K,2) float32 and digests of some images, by row of the index, as far as files hold them.
+
+    Parameters
+    ----------
+    paths : LocalFeatures files that may hold them.
+    """
+    keypoints: dict[int, Array] = {}
+    digests: dict[int, str] = {}
+    for path in paths:
+        with LocalFeatures.open(path) as file:
+            offsets, names = file["offsets"][()], file["digests"].asstr()[()]
+            column = file["keypoints"]
+            for row, image in enumerate(file["image_ids"][()].tolist()):
+                if image in images:
+                    keypoints[image] = column[offsets[row] : offsets[row + 1]]
+                    digests[image] = str(names[row])
+    return keypoints, digests
 
 
 def gather_inlier_matches(paths: Sequence[Path], pairs: Array) -> tuple[Array, Array, Array]:

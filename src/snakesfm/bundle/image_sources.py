@@ -84,7 +84,7 @@ def _open_source(
 ) -> ImageSource:
     """The images scaled down by ``reductions`` (N,)."""
     # not needed where keypoints are not refined
-    from snakesfm.ingest.read import read_image
+    from snakesfm.ingest.read import read_image, scale_down
 
     shorter_sides = np.rint(sizes.min(axis=1) / reductions).astype(int).tolist()
     pixels = float(np.median(sizes.prod(axis=1) / reductions**2)) if len(paths) else 1.0
@@ -98,11 +98,8 @@ def _open_source(
         except ImageError as error:
             print(f"warning: {error}")
             return None
-        height, width = image.gray.shape
-        factor = min(1.0, shorter_sides[row] / min(height, width))
-        size = (max(1, round(width * factor)), max(1, round(height * factor)))
-        gray = image.gray if factor == 1.0 else cv2.resize(image.gray, size, interpolation=cv2.INTER_AREA)
-        scale = image.reduction * np.array([width, height]) / np.array(size)
+        gray = scale_down(image.gray, shorter_sides[row])
+        scale = image.reduction * np.array(image.gray.shape[::-1]) / np.array(gray.shape[::-1])
         return GrayImage(gray, scale / detector_scales[row])
 
     return ImageSource(

@@ -127,11 +127,12 @@ def adjust_rounds(
         # what completion adds is not refined, so it ends where refinement begins
         if row and settings.complete_tracks and (not sources or row < last):
             mapper.complete()
-        for source in sources if row == max(last - 1, 0) else ():
-            source.report(
-                *refine_keypoints(reconstruction, source.read_gray, source.scales, source.settings)
-            )
-            source.release()
+        if row == max(last - 1, 0):
+            for source in sources:
+                source.report(
+                    *refine_keypoints(reconstruction, source.read_gray, source.scales, source.settings)
+                )
+                source.release()
         mapper.round(f"round {row + 1}", threshold, "final" if row == last else "early")
     while settings.register_images and mapper.register():
         mapper.round("registration", settings.thresholds_px[-1], "final")

@@ -6,13 +6,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from snakesfm.features.keypoints import BatchDetector, Detector, KeypointSet
+from snakesfm.features.keypoints import BatchDetector, Detector, KeypointSet, pixels_at
 from snakesfm.features.sift import SiftDetector
-from snakesfm.ingest.masks import select_unmasked
+from snakesfm.ingest.read import scale_down
 
 Array = NDArray[Any]
 
@@ -67,7 +66,10 @@ def extract_keypoints(
     Of each image at most ``max_keypoints`` keypoints in its pixels, strongest first; ties are ordered by
     place, scale and angle, so the order depends on the image alone.
     """
-    small = [_shrink(gray, rgb, max_shorter_side_px) for gray, rgb in images]
+    small = [
+        (scale_down(gray, max_shorter_side_px), scale_down(rgb, max_shorter_side_px))
+        for gray, rgb in images
+    ]
     masks = masks or [None] * len(images)
     counts = [_count_before_mask(max_keypoints, mask) for mask in masks]
     if isinstance(detector, BatchDetector):
@@ -77,7 +79,7 @@ def extract_keypoints(
             detector.detect(gray, rgb, count) for (gray, rgb), count in zip(small, counts, strict=True)
         ]
     found = [
-        points if mask is None else _unmasked(points, mask, seen[0].shape)
+        points if mask is None else points.unmasked(mask, *seen[0].shape[::-1])
         for points, mask, seen in zip(found, masks, small, strict=True)
     ]
     return [
@@ -92,11 +94,6 @@ def _count_before_mask(count: int, mask: Array | None) -> int:
     return math.ceil(count / max(share, SMALLEST_SHARE))
 
 
-def _unmasked(points: KeypointSet, mask: Array, shape: tuple[int, ...]) -> KeypointSet:
-    """The keypoints in an image (H,W) that lie where the mask wants them."""
-    return points.take(np.flatnonzero(select_unmasked(mask, points.keypoints, shape[1], shape[0])))
-
-
 def _strongest(
     found: KeypointSet, count: int, shape: tuple[int, ...], original: tuple[int, ...]
 ) -> KeypointSet:
@@ -107,21 +104,6 @@ def _strongest(
     return found.scaled(original[1] / shape[1], original[0] / shape[0])
 
 
-def _shrink(gray: Array, rgb: Array, max_shorter_side_px: int) -> tuple[Array, Array]:
-    height, width = gray.shape
-    factor = max_shorter_side_px / min(height, width)
-    if factor >= 1:
-        return gray, rgb
-    size = (max(1, round(width * factor)), max(1, round(height * factor)))
-    return (
-        cv2.resize(gray, size, interpolation=cv2.INTER_AREA),
-        cv2.resize(rgb, size, interpolation=cv2.INTER_AREA),
-    )
-
-
 def sample_colors(rgb: Array, keypoints: Array) -> Array:
     """RGB (N,3) uint8 of the pixels that keypoints (N,2) lie in."""
-    height, width = rgb.shape[:2]
-    columns = np.clip(keypoints[:, 0].astype(np.int64), 0, width - 1)
-    rows = np.clip(keypoints[:, 1].astype(np.int64), 0, height - 1)
-    return np.ascontiguousarray(rgb[rows, columns], dtype=np.uint8)
+    return np.ascontiguousarray(pixels_at(rgb, keypoints), dtype=np.uint8)

@@ -47,6 +47,11 @@ class KeypointSet:
             angles=self.angles[rows],
         )
 
+    def unmasked(self, mask: Array, width: float, height: float) -> "KeypointSet":
+        """The keypoints, in an image of a width and height, that lie where a mask (H,W) is true."""
+        rows, columns = mask.shape
+        return self.take(pixels_at(mask, self.keypoints * np.array([columns / width, rows / height])))
+
     def scaled(self, x: float, y: float) -> "KeypointSet":
         """The same keypoints in an image that is ``x`` times wider and ``y`` times higher.
 
@@ -69,6 +74,15 @@ class KeypointSet:
             np.zeros(0, np.float32),
             np.zeros(0, np.float32),
         )
+
+
+def pixels_at(image: Array, keypoints: Array) -> Array:
+    """The pixels (N,...) of an image (H,W,...) that keypoints (N,2) lie in, or are nearest to."""
+    height, width = image.shape[:2]
+    columns = np.clip(keypoints[:, 0].astype(np.int64), 0, width - 1)
+    rows = np.clip(keypoints[:, 1].astype(np.int64), 0, height - 1)
+    found: Array = image[rows, columns]
+    return found
 
 
 class Detector(Protocol):

@@ -22,6 +22,11 @@ SETTLED_NS = 2_000_000_000
 Stamp = tuple[int, int]
 
 
+def walk_images(folder: Path | str) -> Iterator[str]:
+    """The same as :func:`list_images`, one by one and in no order."""
+    return _walk(Path(folder), "", frozenset())
+
+
 def list_images(folder: Path | str) -> list[str]:
     """The image files of a folder at any depth.
 
@@ -36,7 +41,7 @@ def list_images(folder: Path | str) -> list[str]:
     ------
     ConfigError : the folder, or one inside it, cannot be listed.
     """
-    return sorted(_walk(Path(folder), "", frozenset()))
+    return sorted(walk_images(folder))
 
 
 def count_images(folder: Path | str, limit: int | None = None) -> int:
@@ -46,7 +51,7 @@ def count_images(folder: Path | str, limit: int | None = None) -> int:
     ------
     ConfigError : the folder, or one inside it, cannot be listed.
     """
-    return sum(1 for _ in islice(_walk(Path(folder), "", frozenset()), limit))
+    return sum(1 for _ in islice(walk_images(folder), limit))
 
 
 def fingerprint_images(folder: Path | str, cache_file: Path | str | None = None) -> str:

@@ -4,12 +4,10 @@ A mask is black where an image shows what is not to be used, such as sky, water,
 of ``a/b.jpg`` is ``a/b.jpg.png`` in the folder of masks, as in COLMAP; ``a/b.png`` does as well.
 """
 
-from collections.abc import Iterable
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any
 
 from snakesfm.errors import ConfigError
-from snakesfm.ingest.discover import list_images
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -18,26 +16,10 @@ if TYPE_CHECKING:
 MAX_ASPECT_DIFFERENCE = 0.01
 
 
-def find_masks(folder: Path, images: Iterable[str]) -> dict[str, Path]:
-    """The mask of each image that has one, by the image's name.
-
-    Parameters
-    ----------
-    folder : of the masks, searched at any depth.
-    images : POSIX paths relative to the image folder.
-
-    Raises
-    ------
-    ConfigError : the folder cannot be listed.
-    """
-    there = set(list_images(folder))
-    found = {}
-    for image in images:
-        for name in (f"{image}.png", str(PurePosixPath(image).with_suffix(".png"))):
-            if name in there:
-                found[image] = folder / name
-                break
-    return found
+def find_mask(folder: Path, image: str) -> Path | None:
+    """The mask of an image, which is named by its path relative to the image folder; None without one."""
+    names = (f"{image}.png", PurePosixPath(image).with_suffix(".png"))
+    return next((folder / name for name in names if (folder / name).is_file()), None)
 
 
 def read_mask(path: Path, size: tuple[int, int]) -> "NDArray[Any]":
@@ -64,11 +46,3 @@ def read_mask(path: Path, size: tuple[int, int]) -> "NDArray[Any]":
         )
     wanted: NDArray[Any] = gray > 0
     return wanted
-
-
-def select_unmasked(wanted: "NDArray[Any]", keypoints: "NDArray[Any]", width: float, height: float) -> Any:
-    """Which keypoints (N,2), in an image of a width and height, lie where a mask (H,W) is true."""
-    rows, columns = wanted.shape
-    x = (keypoints[:, 0] * (columns / width)).astype(int).clip(0, columns - 1)
-    y = (keypoints[:, 1] * (rows / height)).astype(int).clip(0, rows - 1)
-    return wanted[y, x]

@@ -115,6 +115,17 @@ def read_image(path: Path | str, shorter_side_px: int | None = None) -> ImagePix
             ) from error
 
 
+def scale_down(pixels: Array, shorter_side_px: int) -> Array:
+    """An image (H,W) or (H,W,3) whose shorter side is at most so many pixels; itself where it is small."""
+    height, width = pixels.shape[:2]
+    factor = shorter_side_px / min(height, width)
+    if factor >= 1:
+        return pixels
+    size = (max(1, round(width * factor)), max(1, round(height * factor)))
+    small: Array = cv2.resize(pixels, size, interpolation=cv2.INTER_AREA)
+    return small
+
+
 def _open(path: Path | str) -> Image.Image:
     path = Path(path)
     # as in read_image, the last except takes whatever PIL raises

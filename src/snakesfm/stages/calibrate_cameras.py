@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from snakesfm.artifacts.features import LocalFeatures
+from snakesfm.artifacts.gather import gather_keypoints
 from snakesfm.artifacts.images import CalibratedCameras, ImageIndex
 from snakesfm.artifacts.pairs import PairMatches
 from snakesfm.geometry.camera import Camera, cameras_from_columns, cameras_to_columns
@@ -61,8 +61,9 @@ def _calibrate(
         options.pairs_per_camera,
         options.min_matches,
     )
+    found, _ = gather_keypoints(job.paths("features"), set(candidates[chosen, :2].ravel().tolist()))
     scales = detector_scales(index.sizes, job.settings)
-    keypoints = _read_keypoints(job.paths("features"), set(candidates[chosen, :2].ravel().tolist()), scales)
+    keypoints = {image: reduce_keypoints(points, scales[image]) for image, points in found.items()}
     progress = job.progress(len(chosen), "pairs")
     pairs = []
     for row in chosen.tolist():
@@ -100,19 +101,6 @@ def _read_counts(paths: Iterable[Path]) -> tuple[Array, list[tuple[Path, int, in
     order = sorted(range(len(rows)), key=rows.__getitem__)
     table = np.array([rows[k] for k in order], dtype=np.int64).reshape(-1, 3)
     return table, [places[k] for k in order]
-
-
-def _read_keypoints(paths: Iterable[Path], images: set[int], scales: Array) -> dict[int, Array]:
-    """Keypoints (K,2) of the images in detector pixels."""
-    keypoints: dict[int, Array] = {}
-    for path in paths:
-        with LocalFeatures.open(path) as file:
-            offsets = file["offsets"][()]
-            for row, image in enumerate(file["image_ids"][()].tolist()):
-                if image in images:
-                    found = file["keypoints"][offsets[row] : offsets[row + 1]]
-                    keypoints[image] = reduce_keypoints(found, scales[image])
-    return keypoints
 
 
 def _summary(cameras: list[Camera]) -> str:

@@ -3,14 +3,13 @@
 import hashlib
 import json
 from collections import Counter
-from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from snakesfm.artifacts.features import LocalFeatures
+from snakesfm.artifacts.gather import gather_keypoints
 from snakesfm.artifacts.images import CalibratedCameras, ImageIndex
 from snakesfm.artifacts.pairs import KINDS, REJECTIONS, PairMatches, TwoViewGeometries
 from snakesfm.errors import ArtifactError
@@ -40,8 +39,9 @@ def run(job: StageJob) -> None:
     )
     matches = PairMatches.read(job.path("matches"))
     images = set(matches.pairs.ravel().tolist())
+    found, image_digests = gather_keypoints(job.paths("features"), images)
     scales = detector_scales(index.sizes, job.settings)
-    keypoints, image_digests = _read_keypoints(job.paths("features"), images, scales)
+    keypoints = {image: reduce_keypoints(points, scales[image]) for image, points in found.items()}
     places = {image: first_rows_at_place(points) for image, points in keypoints.items()}
     for image in images - keypoints.keys():
         raise ArtifactError(
@@ -79,25 +79,6 @@ def run(job: StageJob) -> None:
         progress.step()
     _assemble(matches.pairs, rows).write(job.output, job.header)
     print(_summary(rows, reused), flush=True)
-
-
-def _read_keypoints(
-    paths: Iterable[Path], images: set[int], scales: Array
-) -> tuple[dict[int, Array], dict[int, str]]:
-    """Keypoints (K,2) of the images in detector pixels, and the digests of the images."""
-    keypoints: dict[int, Array] = {}
-    digests: dict[int, str] = {}
-    for path in paths:
-        with LocalFeatures.open(path) as file:
-            ids, offsets = file["image_ids"][()], file["offsets"][()]
-            names = file["digests"].asstr()[()]
-            flat = file["keypoints"][()]
-            for row, image in enumerate(ids.tolist()):
-                if image in images:
-                    found = flat[offsets[row] : offsets[row + 1]]
-                    keypoints[image] = reduce_keypoints(found, scales[image])
-                    digests[image] = str(names[row])
-    return keypoints, digests
 
 
 def _best_first(matches: PairMatches, pair: int) -> Array:

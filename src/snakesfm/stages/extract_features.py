@@ -17,7 +17,7 @@ from snakesfm.digests import file_digest
 from snakesfm.errors import ImageError
 from snakesfm.features.extraction import create_detector, extract_keypoints, sample_colors
 from snakesfm.features.keypoints import Detector, KeypointSet, KeypointSource
-from snakesfm.ingest.masks import find_masks, read_mask, select_unmasked
+from snakesfm.ingest.masks import find_mask, read_mask
 from snakesfm.ingest.read import read_image
 from snakesfm.learned.batches import in_batches
 from snakesfm.stages.job import StageJob
@@ -56,7 +56,7 @@ def run(job: StageJob) -> None:
     finder = _create_finder(job, options)
     beside = job.weights_digest() + str(job.settings.get("source_content", ""))
     names = [str(name) for name in index.names[rows]]
-    masks = find_masks(Path(job.settings["masks"]), names) if job.settings.get("masks") else {}
+    masks = _find_masks(job, names)
     contents = {name: file_digest(str(path)) for name, path in masks.items()}
     digests = [
         _digest(str(sha256), options, beside + contents.get(name, ""))
@@ -83,6 +83,14 @@ def run(job: StageJob) -> None:
         f"{len(rows)} images ({reused} taken over){masked}, {sum(counts)} keypoints, "
         f"median {int(np.median(counts)) if counts else 0} per image"
     )
+
+
+def _find_masks(job: StageJob, names: Sequence[str]) -> dict[str, Path]:
+    """The masks of the images that have one, by the image's name."""
+    if not job.settings.get("masks"):
+        return {}
+    found = {name: find_mask(Path(job.settings["masks"]), name) for name in names}
+    return {name: mask for name, mask in found.items() if mask is not None}
 
 
 def _create_finder(job: StageJob, options: "ExtractFeaturesOptions") -> Detector | KeypointSource:
@@ -181,11 +189,7 @@ def _read_known(
 ) -> KeypointSet:
     """The known keypoints of an image, but for those that its mask hides."""
     points = source.read(name, size)
-    return (
-        points
-        if mask is None
-        else points.take(np.flatnonzero(select_unmasked(mask, points.keypoints, *size)))
-    )
+    return points if mask is None else points.unmasked(mask, *size)
 
 
 def _read_former(path: Path, wanted: set[str]) -> Mapping[str, ColoredKeypoints]:
