@@ -18,7 +18,7 @@ import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from benchmarks import ROOT
+from benchmarks import ROOT, SOURCES
 from benchmarks.job_logs import DONE
 from benchmarks.marked_tables import replace_table
 from snakesfm.synthetic.render_demo import make_demo
@@ -82,7 +82,7 @@ def run_workflow(scene: Path, folder: Path, cluster: Cluster | None) -> NodesRun
     done = subprocess.run(
         command,
         cwd=folder,
-        env=cluster.environment if cluster else None,
+        env={**(cluster.environment if cluster else os.environ), **SOURCES},
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,

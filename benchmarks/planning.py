@@ -19,7 +19,7 @@ import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from benchmarks import ROOT
+from benchmarks import ROOT, SOURCES
 from benchmarks.marked_tables import replace_table
 from snakesfm.blocks import tile_names
 from snakesfm.synthetic.render_demo import make_demo
@@ -80,7 +80,9 @@ def call(folder: Path, *arguments: str) -> Need:
     """Run Snakemake: processor seconds with its jobs, and its own largest memory."""
     command = [sys.executable, "-m", "snakemake", "--quiet", "all", *arguments]
     with (folder / "snakemake.out").open("wb") as out:
-        process = subprocess.Popen(command, cwd=folder, stdout=out, stderr=subprocess.STDOUT)
+        process = subprocess.Popen(
+            command, cwd=folder, env={**os.environ, **SOURCES}, stdout=out, stderr=subprocess.STDOUT
+        )
         largest, ended = 0, 0
         while not ended:
             time.sleep(0.1)

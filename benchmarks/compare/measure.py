@@ -15,7 +15,7 @@ from typing import Any
 
 import psutil
 
-from benchmarks import ROOT
+from benchmarks import SOURCES
 
 SAMPLE_S = 0.2
 FOLDERS = re.compile(r"(?:/[^\s/]+)+/")
@@ -79,8 +79,7 @@ def run_measured(command: list[str], folder: Path, log: Path, limit_s: float) ->
             stdout=stream,
             stderr=subprocess.STDOUT,
             start_new_session=True,
-            # the sources beside this file are measured, whichever are installed
-            env={**os.environ, "PYTHONPATH": os.pathsep.join((str(ROOT / "src"), str(ROOT)))},
+            env={**os.environ, **SOURCES},
         )
         try:
             while True:

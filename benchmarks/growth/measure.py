@@ -1,6 +1,7 @@
 """One simulated scene through the workflow, and what its jobs needed."""
 
 import json
+import os
 import shutil
 import subprocess
 import sys
@@ -11,7 +12,7 @@ from pathlib import Path
 import h5py
 import yaml
 
-from benchmarks import ROOT
+from benchmarks import ROOT, SOURCES
 from benchmarks.job_logs import DONE
 from snakesfm.blocks import choose_blocks
 from snakesfm.simulate import Simulation, SimulationOptions
@@ -91,7 +92,9 @@ def measure(
         names = [f"{k % blocks}-{(k + blocks // 2) % blocks}" for k in range(min(tiles, blocks // 2))]
         scene = folder.resolve() / "results" / folder.name
         command += [str(scene / "estimate_two_view" / f"{name}.h5") for name in names]
-    subprocess.run(command, cwd=folder, check=True, stdout=subprocess.DEVNULL)
+    subprocess.run(
+        command, cwd=folder, env={**os.environ, **SOURCES}, check=True, stdout=subprocess.DEVNULL
+    )
     result = collect(options, folder)
     result.config = list(config)
     return result

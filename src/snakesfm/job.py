@@ -70,7 +70,7 @@ def run_job(stage: str) -> None:
     ended = time.time()
     print(
         f"{_clock(ended)} {stage} done in {ended - started:.2f} s, "
-        f"{_processor_seconds() - before:.2f} s of processor time, {_peak_mb():.0f} MB at most",
+        f"{_processor_seconds() - before:.2f} s of processor time, {peak_mb():.0f} MB at most",
         flush=True,
     )
 
@@ -81,8 +81,13 @@ def _processor_seconds() -> float:
     return times.user + times.system + times.children_user + times.children_system
 
 
-def _peak_mb() -> float:
+def peak_mb() -> float:
     """Largest memory of this process so far, exact where Snakemake's record of a job is sampled."""
+    with contextlib.suppress(OSError), Path("/proc/self/status").open(encoding="utf-8") as status:
+        for line in status:
+            if line.startswith("VmHWM:"):
+                return int(line.split()[1]) / 1024
+    # where there is no /proc; it holds what Snakemake had when it started the job, too
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 

@@ -42,3 +42,16 @@ def test_a_here_document_of_many_files_arrives_unchanged() -> None:
     out = subprocess.run(["bash"], input=script, capture_output=True, text=True, check=True).stdout
     assert out.strip() == hashlib.sha256(f"{files}\n".encode()).hexdigest()
     assert len(files) > 1_000_000
+
+
+def test_a_jobs_memory_is_its_own_and_not_that_of_who_started_it() -> None:
+    code = (
+        "import subprocess, sys\n"
+        "ballast = b'x' * 400_000_000\n"
+        "subprocess.run([sys.executable, '-c', sys.argv[1]], check=True)"
+    )
+    report = "from snakesfm.job import peak_mb; print(peak_mb())"
+    out = subprocess.run(
+        [sys.executable, "-c", code, report], capture_output=True, text=True, check=True
+    ).stdout
+    assert 5 < float(out) < 200

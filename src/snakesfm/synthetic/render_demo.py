@@ -10,7 +10,7 @@ import json
 import shutil
 import sys
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from snakesfm.errors import ConfigError, SnakesfmError
 from snakesfm.export.colmap import build_reconstruction
 from snakesfm.seeding import derive_seed
-from snakesfm.synthetic.raster import View, render
+from snakesfm.synthetic.raster import Face, View, render
 from snakesfm.synthetic.scene import DemoOptions, build_scene, camera_path, sample_points, sky
 
 Array = NDArray[Any]
@@ -55,7 +55,10 @@ def make_demo(folder: Path, options: DemoOptions) -> bool:
     folder.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix=f".{folder.name}.", dir=folder.parent) as name:
         temporary = Path(name) / "demo"
-        _write_scene(temporary, options)
+        faces = build_scene(options.seed)
+        views = {f"square_{number:02d}.jpg": view for number, view in enumerate(camera_path(options))}
+        points = sample_points(faces, POINTS, options.seed)
+        write_scene(temporary, faces, views, points, options.seed, options.focal_35mm)
         (temporary / MARKER).write_text(json.dumps(content, indent=1) + "\n", "utf-8")
         if folder.exists():
             shutil.rmtree(folder)
@@ -75,44 +78,60 @@ def visible_points(points: Array, view: View, inverse_depth: Array, samples: int
     return inside, pixels
 
 
-def _write_scene(folder: Path, options: DemoOptions) -> None:
+def write_scene(
+    folder: Path,
+    faces: Sequence[Face],
+    views: Mapping[str, View],
+    points: Array,
+    seed: int,
+    focal_35mm: float,
+    samples: int = SAMPLES,
+    blur_px: float = 0.0,
+) -> None:
+    """Write images/ and reference/ of a scene.
+
+    Parameters
+    ----------
+    views : of all images by file name, of one camera.
+    points : (n,3) world points on the faces, those of the reference.
+    seed : of the images' noise.
+    focal_35mm : focal length that EXIF tells.
+    samples : samples per pixel along each axis.
+    blur_px : standard deviation of the lens's blur; 0 for none.
+    """
     (folder / "images").mkdir(parents=True)
     (folder / "reference").mkdir()
-    faces, views = build_scene(options.seed), camera_path(options)
-    points = sample_points(faces, POINTS, options.seed)
-    names, seen, pixels, colors = [], [], [], []
-    for number, view in enumerate(views):
-        name = f"square_{number:02d}.jpg"
-        image, inverse_depth = render(faces, view, sky(view, SAMPLES), SAMPLES)
-        visible, places = visible_points(points, view, inverse_depth, SAMPLES)
+    seen, pixels, colors = [], [], []
+    for name, view in views.items():
+        image, inverse_depth = render(faces, view, sky(view, samples), samples)
+        if blur_px > 0:
+            image = cv2.GaussianBlur(image, (0, 0), blur_px)
+        visible, places = visible_points(points, view, inverse_depth, samples)
         inside = np.where(visible[:, None], places, 0).astype(int)
         colors.append(np.where(visible[:, None], image[inside[:, 1], inside[:, 0]], np.nan))
-        rng = np.random.default_rng(derive_seed(options.seed, "demo", "noise", name))
+        rng = np.random.default_rng(derive_seed(seed, "demo", "noise", name))
         noisy = image + rng.normal(0.0, NOISE, image.shape).astype(np.float32)
-        _write_photo(folder / "images" / name, np.clip(np.rint(noisy), 0, 255).astype(np.uint8), options)
-        names.append(name)
+        _write_photo(folder / "images" / name, np.clip(np.rint(noisy), 0, 255).astype(np.uint8), focal_35mm)
         seen.append(visible)
         pixels.append(places)
-    _write_reference(folder / "reference", options, names, views, points, (seen, pixels, colors))
+    _write_reference(folder / "reference", views, points, (seen, pixels, colors))
 
 
-def _write_photo(path: Path, image: Array, options: DemoOptions) -> None:
+def _write_photo(path: Path, image: Array, focal_35mm: float) -> None:
     from PIL import ExifTags, Image
 
     exif = Image.Exif()
     exif[ExifTags.Base.Make] = "snakesfm"
     exif[ExifTags.Base.Model] = "virtual full frame"
     details = exif.get_ifd(ExifTags.IFD.Exif)
-    details[ExifTags.Base.FocalLength] = options.focal_35mm
-    details[ExifTags.Base.FocalLengthIn35mmFilm] = round(options.focal_35mm)
+    details[ExifTags.Base.FocalLength] = focal_35mm
+    details[ExifTags.Base.FocalLengthIn35mmFilm] = round(focal_35mm)
     Image.fromarray(image).save(path, quality=JPEG_QUALITY, subsampling=0, exif=exif)
 
 
 def _write_reference(
     folder: Path,
-    options: DemoOptions,
-    names: Sequence[str],
-    views: Sequence[View],
+    views: Mapping[str, View],
     points: Array,
     observed: tuple[Sequence[Array], Sequence[Array], Sequence[Array]],
 ) -> None:
@@ -120,11 +139,11 @@ def _write_reference(
     kept = np.flatnonzero(seen.sum(axis=1) >= MIN_TRACK)
     point_ids, image_ids = np.nonzero(seen[kept])
     model = build_reconstruction(
-        names,
-        np.zeros(len(names), dtype=np.int32),
-        [options.camera],
-        np.array([view.rotation for view in views]),
-        np.array([view.translation for view in views]),
+        list(views),
+        np.zeros(len(views), dtype=np.int32),
+        [next(iter(views.values())).camera],
+        np.array([view.rotation for view in views.values()]),
+        np.array([view.translation for view in views.values()]),
         points[kept],
         np.clip(np.rint(np.nanmean(colors[kept], axis=1)), 0, 255).astype(np.uint8),
         np.zeros(len(kept)),

@@ -81,7 +81,7 @@ def camera_path(options: DemoOptions) -> list[View]:
         radius = options.radius_m + rng.uniform(-0.4, 0.4)
         center = np.array([radius * np.cos(angle), radius * np.sin(angle), 1.75 + rng.uniform(-0.2, 0.25)])
         target = np.array([0.0, 0.0, 2.0]) + rng.uniform(-0.35, 0.35, 3)
-        rotation = _look_at(center, target, np.radians(rng.uniform(-1.5, 1.5)))
+        rotation = look_at(center, target, np.radians(rng.uniform(-1.5, 1.5)))
         views.append(View(options.camera, rotation, translation_of(rotation, center)))
     return views
 
@@ -116,7 +116,7 @@ def sample_points(faces: list[Face], count: int, seed: int) -> Array:
     return points
 
 
-def _look_at(center: Array, target: Array, roll_rad: float) -> Array:
+def look_at(center: Array, target: Array, roll_rad: float) -> Array:
     """cam_from_world rotation of a camera at ``center`` that looks at ``target``, with z up."""
     forward = (target - center) / np.linalg.norm(target - center)
     right = np.cross(forward, [0.0, 0.0, 1.0])
