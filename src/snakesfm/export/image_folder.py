@@ -2,6 +2,8 @@
 
 import os
 import shutil
+import struct
+import zlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -10,15 +12,19 @@ from numpy.typing import NDArray
 
 Array = NDArray[Any]
 UPRIGHT = (0, 1)
-JPEG_QUALITY = 95
+EXIF_MARK = b"Exif\0\0"
+ORIENTATION = 0x0112
+# of EXIF's types SHORT and LONG
+VALUE_FORMATS = {3: "H", 4: "I"}
 
 
 def place_images(target: Path, images: Path, names: Sequence[str], orientations: Array) -> None:
     """Make ``target`` show the images as the model sees them.
 
     It is one link to ``images``, relative where both lie under one top folder, so that they can be moved
-    together; a copy where links cannot be made. If EXIF turned some images, it is a folder of links with
-    upright copies of those, because most readers of models ignore EXIF.
+    together; a copy where links cannot be made. If EXIF turns some images, it is a folder of links with
+    copies of those that EXIF does not turn: the model is of the pixels as they are stored, which is what
+    COLMAP, 3DGS and nerfstudio read, but OpenCV and others would turn them.
 
     Parameters
     ----------
@@ -42,7 +48,7 @@ def place_images(target: Path, images: Path, names: Sequence[str], orientations:
         place = target / name
         place.parent.mkdir(parents=True, exist_ok=True)
         if name in turned:
-            _write_upright(images / name, place)
+            _write_unturned(images / name, place)
         elif not _link(place, images / name):
             shutil.copyfile(images / name, place)
 
@@ -59,10 +65,31 @@ def _link(link: Path, source: Path) -> bool:
     return True
 
 
-def _write_upright(source: Path, place: Path) -> None:
-    from PIL import Image, ImageOps
+def _write_unturned(source: Path, place: Path) -> None:
+    """Copy an image with an EXIF orientation of 1, and all else, its pixels too, byte for byte."""
+    from PIL import Image
 
+    content = bytearray(source.read_bytes())
     with Image.open(source) as image:
-        upright = ImageOps.exif_transpose(image)
-        options = {"quality": JPEG_QUALITY, "subsampling": 0} if image.format == "JPEG" else {}
-        upright.save(place, format=image.format, **options)
+        kind = image.format
+        block = bytes(image.info.get("exif", b"")).removeprefix(EXIF_MARK)
+    # a TIFF file is itself what other files hold as their EXIF
+    start = 0 if kind == "TIFF" else content.find(block) if block else -1
+    # orientation may stand elsewhere (XMP), where hardly a reader looks
+    if start >= 0:
+        _set_upright(content, start)
+        if kind == "PNG":
+            end = start + len(block)
+            content[end : end + 4] = zlib.crc32(content[start - 4 : end]).to_bytes(4, "big")
+    place.write_bytes(content)
+
+
+def _set_upright(content: bytearray, start: int) -> None:
+    """Set the orientation in the first directory of the TIFF structure at ``start`` to 1."""
+    order = "<" if content[start : start + 2] == b"II" else ">"
+    (directory,) = struct.unpack_from(f"{order}I", content, start + 4)
+    (entries,) = struct.unpack_from(f"{order}H", content, start + directory)
+    for entry in range(start + directory + 2, start + directory + 2 + 12 * entries, 12):
+        tag, kind = struct.unpack_from(f"{order}HH", content, entry)
+        if tag == ORIENTATION and kind in VALUE_FORMATS:
+            struct.pack_into(order + VALUE_FORMATS[kind], content, entry + 8, 1)

@@ -6,6 +6,7 @@ import struct
 from collections.abc import Iterable
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pycolmap
 import pytest
@@ -33,6 +34,7 @@ from snakesfm.synthetic.problems import SyntheticProblem, make_problem
 
 COUNT = 9
 LOST = 8
+ORIENTATION = 0x0112
 FILES = (
     "sparse/0/cameras.bin",
     "sparse/0/images.bin",
@@ -293,19 +295,23 @@ def test_images_are_copied_where_links_cannot_be_made(tmp_path, problem, monkeyp
     assert (folder / "images" / NAMES[1]).read_bytes() == (tmp_path / "photos" / NAMES[1]).read_bytes()
 
 
-def test_an_image_that_exif_turns_is_upright_beside_the_model(tmp_path, problem) -> None:
+def test_an_image_that_exif_turns_is_shown_as_it_is_stored(tmp_path, problem) -> None:
     photos = make_images(tmp_path / "photos")
+    stored = np.random.default_rng(0).integers(0, 255, (48, 64, 3)).astype(np.uint8)
     exif = Image.Exif()
-    exif[0x0112] = 6
-    Image.new("RGB", (48, 64), "blue").save(photos / NAMES[2], exif=exif)
+    exif[ORIENTATION] = 6
+    Image.fromarray(stored).save(photos / NAMES[2], exif=exif)
     orientations = np.ones(COUNT, np.int32)
     orientations[2] = 6
     folder = export(tmp_path, problem, orientations)
-    with Image.open(folder / "images" / NAMES[2]) as upright:
-        assert upright.size == (64, 48)
-        assert upright.getexif().get(0x0112, 1) == 1
+    shown = folder / "images" / NAMES[2]
+    # OpenCV turns images by their EXIF, PIL does not
+    assert cv2.imread(str(photos / NAMES[2])).shape[:2] == (64, 48)
+    assert cv2.imread(str(shown)).shape[:2] == (48, 64)
+    with Image.open(shown) as image, Image.open(photos / NAMES[2]) as original:
+        assert image.getexif()[ORIENTATION] == 1
+        np.testing.assert_array_equal(np.asarray(image), np.asarray(original))
     assert (folder / "images" / NAMES[1]).is_symlink()
-    assert (photos / NAMES[2]).is_file()
     export(tmp_path, problem)
     assert (folder / "images").is_symlink()
 
