@@ -342,7 +342,8 @@ class ScenePlan:
         if stage == "adjust_bundle":
             return {"images": str(self.images), "intrinsics": inputs.intrinsics}
         if stage == "export_model":
-            return {"images": str(self.images)}
+            masks = {"masks": str(self.masks)} if inputs.masks else {}
+            return {"images": str(self.images)} | masks
         if stage == "evaluate_model":
             return {"reference": inputs.reference, "reference_content": file_digest(inputs.reference)}
         return {}

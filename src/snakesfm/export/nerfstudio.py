@@ -1,6 +1,6 @@
 """A model as nerfstudio's transforms.json."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -29,6 +29,7 @@ def transforms(
     rotations: Array,
     translations: Array,
     registered: Array,
+    masks: Mapping[str, str],
 ) -> dict[str, Any]:
     """The content of transforms.json.
 
@@ -42,6 +43,8 @@ def transforms(
     names, camera_ids, cameras : images of the index and their cameras, pixel centres at .5.
     rotations, translations : (N,3,3), (N,3) cam_from_world.
     registered : rows of the images that have a pose.
+    masks : of each image by its name, as paths relative to ``masks/``; empty for none, as nerfstudio takes
+        one for every image or no one.
     """
     used = sorted({int(camera_ids[row]) for row in registered})
     intrinsics = {row: camera_intrinsics(cameras[row]) for row in used}
@@ -56,6 +59,8 @@ def transforms(
             "transform_matrix": opengl_world_from_cam(rotations[row], translations[row]).tolist(),
             "colmap_im_id": row + 1,
         }
+        if masks:
+            frame["mask_path"] = f"masks/{masks[names[row]]}"
         if len(used) > 1:
             frame |= intrinsics[int(camera_ids[row])]
         frames.append(frame)

@@ -4,6 +4,7 @@ A mask is black where an image shows what is not to be used, such as sky, water,
 of ``a/b.jpg`` is ``a/b.jpg.png`` in the folder of masks, as in COLMAP; ``a/b.png`` does as well.
 """
 
+from collections.abc import Mapping
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any
 
@@ -20,6 +21,20 @@ def find_mask(folder: Path, image: str) -> Path | None:
     """The mask of an image, which is named by its path relative to the image folder; None without one."""
     names = (f"{image}.png", PurePosixPath(image).with_suffix(".png"))
     return next((folder / name for name in names if (folder / name).is_file()), None)
+
+
+def masks_as_large(folder: Path, sizes: Mapping[str, tuple[int, int]]) -> dict[str, str]:
+    """The masks of just their image's width and height, relative to ``folder``, by the image's name."""
+    from PIL import Image
+
+    found = {}
+    for image, size in sizes.items():
+        mask = find_mask(folder, image)
+        if mask is not None:
+            with Image.open(mask) as opened:
+                if opened.size == size:
+                    found[image] = mask.relative_to(folder).as_posix()
+    return found
 
 
 def read_mask(path: Path, size: tuple[int, int]) -> "NDArray[Any]":

@@ -8,6 +8,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from snakesfm.artifacts import ImageIndex, Reconstruction
 from snakesfm.export.colmap import (
     build_reconstruction,
@@ -22,6 +24,7 @@ from snakesfm.export.undistorted import write_undistorted
 from snakesfm.geometry.camera import Camera, cameras_from_columns
 from snakesfm.geometry.earth import local_origin
 from snakesfm.geometry.poses import center_of, translation_of
+from snakesfm.ingest.masks import masks_as_large
 from snakesfm.stages.job import StageJob
 
 if TYPE_CHECKING:
@@ -39,6 +42,11 @@ SPACES = (
 OTHER_MODELS = (
     "{images} images have no tie to the others: each part of them is a model of its own, in a world of its "
     "own, in a folder beside sparse/0 ({count} in number)."
+)
+
+MISSING_MASKS = (
+    "transforms.json names no masks, as nerfstudio wants one of its image's size for every image: {count} "
+    "images have none such, '{first}' for one."
 )
 
 NO_PLACE = "georeference is true, but fewer than four registered images tell their position in EXIF."
@@ -61,6 +69,7 @@ def run(job: StageJob) -> None:
         warnings.append(OTHER_MODELS.format(images=sum(others), count=len(others)))
     if job.options.georeference is True and place is None:
         warnings.append(NO_PLACE)
+    masks = _masks(job, {names[row]: cameras[index.camera_ids[row]] for row in registered}, warnings)
     for line in warnings:
         sys.stderr.write(f"warning: {line}\n")
     folder = _export_folder(job)
@@ -80,7 +89,7 @@ def run(job: StageJob) -> None:
             if number == 0:
                 colmap.export_PLY(str(temporary / "points.ply"))
         content = transforms(
-            names, index.camera_ids, cameras, model.rotations, model.translations, registered
+            names, index.camera_ids, cameras, model.rotations, model.translations, registered, masks
         )
         _write_json(temporary / "transforms.json", content)
         summary = summarize(job.scene, names, adjusted.models, model.offsets, model.errors_px, warnings)
@@ -88,12 +97,30 @@ def run(job: StageJob) -> None:
         options: ExportModelOptions = job.options
         if options.link_images or options.undistort:
             place_images(folder / "images", Path(job.settings["images"]), names, index.orientations)
+        if options.link_images and masks:
+            upright = np.ones(len(masks), np.int32)
+            place_images(folder / "masks", Path(job.settings["masks"]), list(masks.values()), upright)
+        elif (folder / "masks").is_symlink():
+            (folder / "masks").unlink()
         if options.undistort:
             write_undistorted(temporary / UNDISTORTED, sparse / "0", folder / "images", job.threads)
         shutil.rmtree(folder / UNDISTORTED, ignore_errors=True)
         for former in (folder / "sparse").glob("[1-9]*"):
             shutil.rmtree(former)
         _publish(temporary, folder)
+
+
+def _masks(job: StageJob, cameras: dict[str, Camera], warnings: list[str]) -> dict[str, str]:
+    """The masks of all images, given with their cameras; none and a warning where some are missing."""
+    if "masks" not in job.settings:
+        return {}
+    sizes = {name: (camera.width, camera.height) for name, camera in cameras.items()}
+    masks = masks_as_large(Path(job.settings["masks"]), sizes)
+    missing = sorted(sizes.keys() - masks.keys())
+    if missing:
+        warnings.append(MISSING_MASKS.format(count=len(missing), first=missing[0]))
+        return {}
+    return masks
 
 
 def _placed(

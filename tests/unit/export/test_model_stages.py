@@ -127,6 +127,7 @@ def export(
     orientations: np.ndarray | None = None,
     lost: Iterable[int] = (LOST,),
     gps: np.ndarray | None = None,
+    masks: Path | None = None,
     **options: bool,
 ) -> Path:
     inputs = {
@@ -144,7 +145,7 @@ def export(
             inputs,
             tuple(folder / file for file in FILES),
             ExportModelOptions(**options),
-            {"images": str(images)},
+            {"images": str(images)} | ({"masks": str(masks)} if masks else {}),
         )
     )
     return folder
@@ -314,6 +315,24 @@ def test_an_image_that_exif_turns_is_shown_as_it_is_stored(tmp_path, problem) ->
     assert (folder / "images" / NAMES[1]).is_symlink()
     export(tmp_path, problem)
     assert (folder / "images").is_symlink()
+
+
+def test_masks_go_with_the_images_where_all_have_one_of_their_size(tmp_path, problem) -> None:
+    masks = tmp_path / "masks"
+    for name in NAMES:
+        (masks / name).parent.mkdir(parents=True, exist_ok=True)
+        Image.new("L", (640, 480), 255).save(masks / f"{name}.png")
+    folder = export(tmp_path, problem, masks=masks)
+    frames = json.loads((folder / "transforms.json").read_text("utf-8"))["frames"]
+    assert [frame["mask_path"] for frame in frames] == [f"masks/{name}.png" for name in NAMES[:LOST]]
+    assert all((folder / frame["mask_path"]).is_file() for frame in frames)
+    Image.new("L", (320, 240), 255).save(masks / f"{NAMES[3]}.png")
+    export(tmp_path, problem, masks=masks)
+    content = json.loads((folder / "transforms.json").read_text("utf-8"))
+    assert not any("mask_path" in frame for frame in content["frames"])
+    assert not (folder / "masks").exists()
+    *_, warning = json.loads((folder / "summary.json").read_text("utf-8"))["warnings"]
+    assert f"1 images have none such, '{NAMES[3]}' for one" in warning
 
 
 def test_undistorted_images_have_pinhole_cameras_and_go_when_no_longer_asked_for(tmp_path, problem) -> None:

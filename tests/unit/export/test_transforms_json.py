@@ -97,7 +97,7 @@ def test_one_camera_stands_at_the_top_and_several_in_the_frames() -> None:
     cameras = [Camera("PINHOLE", *SIZE, (500.0, 500.0, 320.0, 240.0)) for _ in range(2)]
     rotations, translations = np.tile(np.eye(3), (3, 1, 1)), np.zeros((3, 3))
     names = ["b.jpg", "a.jpg", "c.jpg"]
-    one = transforms(names, np.zeros(3, int), cameras, rotations, translations, np.array([0, 1, 2]))
+    one = transforms(names, np.zeros(3, int), cameras, rotations, translations, np.array([0, 1, 2]), {})
     assert one["fl_x"] == 500.0
     assert "fl_x" not in one["frames"][0]
     assert [frame["file_path"] for frame in one["frames"]] == [
@@ -105,6 +105,6 @@ def test_one_camera_stands_at_the_top_and_several_in_the_frames() -> None:
         "images/b.jpg",
         "images/c.jpg",
     ]
-    two = transforms(names, np.array([0, 0, 1]), cameras, rotations, translations, np.array([0, 2]))
+    two = transforms(names, np.array([0, 0, 1]), cameras, rotations, translations, np.array([0, 2]), {})
     assert "fl_x" not in two
     assert all(frame["fl_x"] == 500.0 for frame in two["frames"])
