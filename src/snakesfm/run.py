@@ -154,6 +154,8 @@ class Run:
         self._note("")
         for scene in self.plan.scenes.values():
             print(self.describe(scene), flush=True)
+            for warning in self._summary(scene).get("warnings", ()):
+                print(f"snakesfm: scene '{scene.name}': warning: {warning}", flush=True)
 
     def fail(self) -> None:
         """One line per scene: its model where it has one, else the sentences of its failed jobs."""
@@ -195,12 +197,20 @@ class Run:
                 )
         return sentences
 
+    def _summary(self, scene: ScenePlan) -> dict[str, Any]:
+        """What export_model says of the scene's model; empty where there is none."""
+        try:
+            summary: dict[str, Any] = json.loads(
+                (scene.folder / "export_model" / "summary.json").read_text("utf-8")
+            )
+        except (OSError, ValueError):
+            return {}
+        return summary
+
     def describe(self, scene: ScenePlan) -> str:
         """How many images are registered, the points, the error, the time, and where the model is."""
-        path = scene.folder / "export_model" / "summary.json"
-        try:
-            summary = json.loads(path.read_text("utf-8"))
-        except (OSError, ValueError):
+        summary = self._summary(scene)
+        if not summary:
             database = Path(scene.database_file())
             made = f"COLMAP database in {database}, " if database.is_file() else ""
             return f"snakesfm: scene '{scene.name}': {made}no model yet."
@@ -215,7 +225,7 @@ class Run:
             f"snakesfm: scene '{scene.name}': {summary['registered_images']} of {summary['images']} images "
             f"registered{more}, {summary['points']} points, mean reprojection error "
             f"{summary['mean_reprojection_error_px']:.3f} px{accuracy}, "
-            f"{time.time() - self.started:.0f} s; model in {path.parent / 'sparse' / '0'}"
+            f"{time.time() - self.started:.0f} s; model in {scene.folder / 'export_model' / 'sparse' / '0'}"
         )
 
 

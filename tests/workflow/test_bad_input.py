@@ -62,6 +62,16 @@ def test_a_wrong_call_gives_one_sentence(
     assert not list(workflow.folder.glob("out/*/*/*.h5"))
 
 
+def test_a_quiet_call_gives_its_sentence_too(workflow) -> None:
+    telephone = workflow.folder / "telephone"
+    telephone.mkdir()
+    (telephone / "IMG_1.HEIC").write_bytes(b"what telephones write")
+    outcome = workflow.run("--quiet", "all", "--config", "output=out", "images=telephone")
+    assert outcome.status != 0
+    assert "Traceback" not in outcome.text
+    assert outcome.text.count("convert those like 'IMG_1.HEIC' to JPEG (1 in number)") == 1
+
+
 def test_one_image_is_too_few(workflow, small_scene: Path) -> None:
     fill(workflow.folder / "one", photographs(small_scene, 1))
     outcome = workflow.run("--config", "images=one", "output=out")
@@ -120,6 +130,8 @@ def test_names_and_files_of_all_kinds(workflow, small_scene: Path) -> None:
     (folder / "empty.jpg").write_bytes(b"")
     (folder / "folder.jpg").mkdir()
     (folder / "notes.txt").write_text("not looked at")
+    (folder / "IMG_1.HEIC").write_bytes(b"what telephones write")
+    (folder / "png.NEF").write_bytes(b"raw, beside its png")
     outcome = workflow.run("--config", "images=Fotos von heute", "output=out put")
     assert outcome.status == 0, outcome.text
     scene = workflow.folder / "out put" / "Fotos von heute"
@@ -127,7 +139,9 @@ def test_names_and_files_of_all_kinds(workflow, small_scene: Path) -> None:
     assert summary["images"] == 14
     assert summary["registered_images"] == 14
     log = (scene / "logs" / "index_images" / "job.log").read_text()
-    for name in ("truncated.jpg", "text.jpg", "empty.jpg"):
+    assert "png.NEF" not in log
+    assert any("warning: 4 image files could not be used" in line for line in outcome.summary)
+    for name in ("truncated.jpg", "text.jpg", "empty.jpg", "IMG_1.HEIC"):
         assert any(name in line and "warning" in line.lower() for line in log.splitlines())
     frames = json.loads((scene / "export_model" / "transforms.json").read_text())["frames"]
     for frame in frames:

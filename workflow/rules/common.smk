@@ -6,7 +6,7 @@ import shlex
 import sys
 
 from snakemake.exceptions import WorkflowError
-from snakemake.settings.types import DeploymentMethod
+from snakemake.settings.types import DeploymentMethod, Quietness
 
 from snakesfm import resources, slurm
 from snakesfm.errors import SnakesfmError
@@ -14,6 +14,14 @@ from snakesfm.blocks import tile_names
 from snakesfm.plan import Plan
 from snakesfm.records import makes_nothing
 from snakesfm.run import Run
+
+
+def refusal(error):
+    """The error as one of Snakemake's, which '--quiet all' hides, so that the sentence is said here then."""
+    if Quietness.ALL in (workflow.output_settings.quiet or ()):
+        sys.stderr.write(f"snakesfm: {error}\n")
+    return WorkflowError(str(error))
+
 
 try:
     # Snakemake knows its targets only later, and this one needs no images
@@ -23,7 +31,7 @@ try:
     if workflow.is_main_process and not makes_nothing(sys.argv[1:]):
         RUN.refuse_unrecorded()
 except SnakesfmError as error:
-    raise WorkflowError(str(error)) from None
+    raise refusal(error) from None
 
 IN_CONTAINER = (
     DeploymentMethod.APPTAINER in workflow.deployment_settings.deployment_method
@@ -250,7 +258,7 @@ def start_run():
     try:
         RUN.start(slurm_run)
     except SnakesfmError as error:
-        raise WorkflowError(str(error)) from None
+        raise refusal(error) from None
 
 
 def finish_run(log):

@@ -10,11 +10,16 @@ import tempfile
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import islice
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 from snakesfm.errors import ConfigError
 
 SUFFIXES = (".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp")
+# photographs as telephones and cameras write them, which COLMAP and the tools after it do not read either
+UNREAD_SUFFIXES = (
+    *(".avif", ".heic", ".heif", ".jxl"),
+    *(".arw", ".cr2", ".cr3", ".dng", ".nef", ".orf", ".raf", ".rw2"),
+)
 CACHE_VERSION = 1
 # a file that was written so shortly before may change again within one tick of the file system's clock
 SETTLED_NS = 2_000_000_000
@@ -24,7 +29,24 @@ Stamp = tuple[int, int]
 
 def walk_images(folder: Path | str) -> Iterator[str]:
     """The same as :func:`list_images`, one by one and in no order."""
-    return _walk(Path(folder), "", frozenset())
+    return _walk(Path(folder), "", frozenset(), SUFFIXES)
+
+
+def list_unread(folder: Path | str) -> list[str]:
+    """Photographs of formats that are not read, but for those with an image of the same name beside them.
+
+    Returns
+    -------
+    POSIX paths relative to ``folder``, sorted.
+
+    Raises
+    ------
+    ConfigError : the folder, or one inside it, cannot be listed.
+    """
+    names = sorted(_walk(Path(folder), "", frozenset(), SUFFIXES + UNREAD_SUFFIXES))
+    unread = [name for name in names if name.lower().endswith(UNREAD_SUFFIXES)]
+    read = {PurePosixPath(name).with_suffix("") for name in set(names).difference(unread)}
+    return [name for name in unread if PurePosixPath(name).with_suffix("") not in read]
 
 
 def list_images(folder: Path | str) -> list[str]:
@@ -112,7 +134,7 @@ def digest_images(
     return {name: digests[name] for name in names}
 
 
-def _walk(folder: Path, prefix: str, above: frozenset[Stamp]) -> Iterator[str]:
+def _walk(folder: Path, prefix: str, above: frozenset[Stamp], suffixes: tuple[str, ...]) -> Iterator[str]:
     try:
         status = folder.stat()
         with os.scandir(folder) as listing:
@@ -129,8 +151,8 @@ def _walk(folder: Path, prefix: str, above: frozenset[Stamp]) -> Iterator[str]:
         if _is(entry, "is_dir"):
             target = entry.stat()
             if (target.st_dev, target.st_ino) not in above:
-                yield from _walk(Path(entry.path), f"{prefix}{entry.name}/", above)
-        elif entry.name.lower().endswith(SUFFIXES) and (
+                yield from _walk(Path(entry.path), f"{prefix}{entry.name}/", above, suffixes)
+        elif entry.name.lower().endswith(suffixes) and (
             _is(entry, "is_file") or (entry.is_symlink() and not Path(entry.path).exists())
         ):
             yield prefix + entry.name

@@ -49,6 +49,8 @@ MISSING_MASKS = (
     "images have none such, '{first}' for one."
 )
 
+REFUSED = "{count} image files could not be used (all in the report): {first}"
+
 NO_PLACE = "georeference is true, but fewer than four registered images tell their position in EXIF."
 
 
@@ -67,6 +69,8 @@ def run(job: StageJob) -> None:
     others = other_model_sizes(adjusted.models)
     if others:
         warnings.append(OTHER_MODELS.format(images=sum(others), count=len(others)))
+    if len(index.refused_names):
+        warnings.append(REFUSED.format(count=len(index.refused_names), first=index.refused_reasons[0]))
     if job.options.georeference is True and place is None:
         warnings.append(NO_PLACE)
     masks = _masks(job, {names[row]: cameras[index.camera_ids[row]] for row in registered}, warnings)

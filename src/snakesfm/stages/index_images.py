@@ -13,7 +13,7 @@ from snakesfm.artifacts.images import ImageIndex
 from snakesfm.errors import ImageError, SceneError
 from snakesfm.geometry.camera import cameras_to_columns
 from snakesfm.ingest.cameras import ImageCameras, Photograph, assign_cameras
-from snakesfm.ingest.discover import digest_images, fingerprint, list_images
+from snakesfm.ingest.discover import digest_images, fingerprint, list_images, list_unread
 from snakesfm.ingest.known import match_known_cameras, read_known_cameras
 from snakesfm.ingest.read import read_header
 from snakesfm.seeding import block_of
@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from snakesfm.config.index_images import IndexImagesOptions
 
 DIGESTS_NAME = "digests.json"
+UNREAD = "{path} is of a format that is not read: convert it to JPEG."
 
 
 def run(job: StageJob) -> None:
@@ -41,6 +42,7 @@ def run(job: StageJob) -> None:
     names = list_images(folder)
     digests = digest_images(folder, names, job.output.parent / DIGESTS_NAME, job.threads)
     photographs, refused = _read_headers(job, folder, names)
+    refused |= {name: UNREAD.format(path=folder / name) for name in list_unread(folder)}
     _check_scene(folder, names, {digests[p.name] for p in photographs}, refused)
     sizes = [(p.width, p.height) for p in photographs]
     found = assign_cameras(

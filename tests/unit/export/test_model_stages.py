@@ -221,8 +221,9 @@ def test_summary_says_what_is_there_and_what_is_missing(tmp_path, problem) -> No
     assert summary["points"] == len(problem.points)
     assert 0.1 < summary["mean_reprojection_error_px"] < 0.5
     assert summary["mean_track_length"] == pytest.approx(summary["observations"] / summary["points"])
-    assert len(summary["warnings"]) == 1
-    assert "spaces" in summary["warnings"][0]
+    spaces, refused = summary["warnings"]
+    assert "spaces" in spaces
+    assert refused == "1 image files could not be used (all in the report): It is a text file."
 
 
 def gps_of(problem: SyntheticProblem, noise_m: float) -> np.ndarray:

@@ -7,7 +7,13 @@ import time
 import pytest
 
 from snakesfm.errors import ConfigError
-from snakesfm.ingest.discover import count_images, digest_images, fingerprint_images, list_images
+from snakesfm.ingest.discover import (
+    count_images,
+    digest_images,
+    fingerprint_images,
+    list_images,
+    list_unread,
+)
 
 ODD_NAMES = ["a b.jpg", "#1.png", "{x}.JPEG", "dir/a b.jpg", "Ünï/写真.TIF", "z.WebP", "scan.bmp"]
 
@@ -25,6 +31,14 @@ def test_lists_odd_names_at_any_depth_sorted(tmp_path):
     touch_all(tmp_path, [*ODD_NAMES, ".hidden.jpg", ".git/a.jpg", "notes.txt", "jpg", "movie.mp4"])
     (tmp_path / "folder.jpg").mkdir()
     assert list_images(tmp_path) == sorted(ODD_NAMES)
+
+
+def test_photographs_that_are_not_read_are_told_but_for_those_beside_an_image(tmp_path):
+    touch_all(
+        tmp_path, ["a/1.HEIC", "a/2.nef", "a/2.JPG", "b/2.nef", "c.d.cr3", "c.jpg", ".e.heic", "f.mov"]
+    )
+    assert list_unread(tmp_path) == ["a/1.HEIC", "b/2.nef", "c.d.cr3"]
+    assert list_images(tmp_path) == ["a/2.JPG", "c.jpg"]
 
 
 def test_counts_up_to_the_limit(tmp_path):
