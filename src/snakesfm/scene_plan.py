@@ -340,7 +340,8 @@ class ScenePlan:
                 "pairs_content": file_digest(self.pairs_file),
             }
         if stage == "adjust_bundle":
-            return {"images": str(self.images), "intrinsics": inputs.intrinsics}
+            model = self.configuration.index_images.camera_model
+            return {"images": str(self.images), "intrinsics": inputs.intrinsics, "camera_model": model}
         if stage == "export_model":
             masks = {"masks": str(self.masks)} if inputs.masks else {}
             return {"images": str(self.images)} | masks

@@ -100,7 +100,11 @@ def from_reconstruction(reconstruction: pycolmap.Reconstruction, model: BundleMo
     model : gives the cameras' sources and which camera took each image.
     """
     cameras = tuple(
-        replace(camera, params=tuple(float(p) for p in reconstruction.camera(row + 1).params))
+        replace(
+            camera,
+            model=reconstruction.camera(row + 1).model_name,
+            params=tuple(float(p) for p in reconstruction.camera(row + 1).params),
+        )
         for row, camera in enumerate(model.cameras)
     )
     rotations = np.full((len(model.camera_ids), 3, 3), np.nan)

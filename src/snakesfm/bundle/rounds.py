@@ -22,6 +22,7 @@ from snakesfm.bundle.filtering import (
 from snakesfm.bundle.image_sources import ImageSource
 from snakesfm.bundle.interface import BundleAdjuster, Loss, SolverSettings
 from snakesfm.bundle.keypoint_refinement import refine_keypoints
+from snakesfm.bundle.lenses import find_wider_lenses, set_camera
 from snakesfm.bundle.principal_points import find_told_cameras
 from snakesfm.bundle.registration import left_out_images, register_left_out
 from snakesfm.bundle.selection import adjust_selection
@@ -52,6 +53,7 @@ class RoundSettings:
     last_loss: Loss = "huber"
     outlier_sigmas: float = 12.0
     distortion_from_round: int = 2
+    widen_lenses: bool = False
     refine_principal_points: bool = True
     max_principal_point_gap: float = 0.003
     min_principal_point_offset: float = 0.004
@@ -124,16 +126,15 @@ def adjust_rounds(
     if settings.rotations_first:
         mapper.round("rotations fixed", settings.thresholds_px[0] * 2, constant_rotations=True)
     for row, threshold in enumerate(settings.thresholds_px):
+        phase: Phase = "final" if row == last else "early"
+        refining = sources if row == max(last - 1, 0) else ()
         # what completion adds is not refined, so it ends where refinement begins
-        if row and settings.complete_tracks and (not sources or row < last):
-            mapper.complete()
-        if row == max(last - 1, 0):
-            for source in sources:
-                source.report(
-                    *refine_keypoints(reconstruction, source.read_gray, source.scales, source.settings)
-                )
-                source.release()
-        mapper.round(f"round {row + 1}", threshold, "final" if row == last else "early")
+        completing = bool(row) and settings.complete_tracks and (not sources or row < last)
+        mapper.prepare(completing, refining)
+        mapper.round(f"round {row + 1}", threshold, phase)
+        if row == max(last - 1, 0) and mapper.widen_lenses():
+            mapper.prepare(completing, refining)
+            mapper.round(f"round {row + 1} with wider lenses", threshold, phase)
     while settings.register_images and mapper.register():
         mapper.round("registration", settings.thresholds_px[-1], "final")
     if settings.refine_principal_points and settings.solver == "ceres":
@@ -161,7 +162,7 @@ class _Mapper:
     ) -> None:
         self.reconstruction = reconstruction
         self.read_graph = read_graph
-        self.cameras = cameras
+        self.cameras = list(cameras)
         self.solving = solving
         self.settings = settings
         self.report = report
@@ -220,6 +221,31 @@ class _Mapper:
         if phase != "early":
             deregister_weak_images(self.reconstruction, settings.min_observations)
         self.record(name, costs)
+
+    def prepare(self, completing: bool, sources: Sequence[ImageSource]) -> None:
+        """What comes before a round: tracks are completed, and keypoints refined by each of ``sources``."""
+        if completing:
+            self.complete()
+        for source in sources:
+            source.report(
+                *refine_keypoints(self.reconstruction, source.read_gray, source.scales, source.settings)
+            )
+            source.release()
+
+    def widen_lenses(self) -> bool:
+        """Give cameras whose lens is not of their model a wider one; whether there were some."""
+        settings = self.settings
+        told = len(self.records) >= settings.distortion_from_round
+        if not settings.widen_lenses or not told or settings.solver != "ceres":
+            return False
+        free = frozenset(self.reconstruction.cameras) - self.solving.constant_cameras
+        solving = replace(self.solving, loss_scale_px=self.loss_scale_px())
+        wider = find_wider_lenses(self.reconstruction, self.adjust, solving, free)
+        for camera_id, camera in wider.items():
+            set_camera(self.reconstruction, camera_id, camera)
+            # what went wild later would else go back to the former model
+            self.cameras[camera_id - 1] = replace(camera, source=self.cameras[camera_id - 1].source)
+        return bool(wider)
 
     def record(self, name: str, costs: tuple[float, float]) -> None:
         """Take down what was done, and report it."""

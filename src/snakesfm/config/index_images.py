@@ -16,6 +16,7 @@ class IndexImagesOptions(StageOptions):
     """Which images share a camera: alike in EXIF or, without it, in folder and size, or a fixed rule."""
 
     camera_model: Literal[
+        "auto",
         "SIMPLE_PINHOLE",
         "PINHOLE",
         "SIMPLE_RADIAL",
@@ -25,8 +26,8 @@ class IndexImagesOptions(StageOptions):
         "OPENCV_FISHEYE",
         "SIMPLE_RADIAL_FISHEYE",
         "RADIAL_FISHEYE",
-    ] = "SIMPLE_RADIAL"
-    """COLMAP camera model of the cameras whose intrinsics are not given."""
+    ] = "auto"
+    """COLMAP camera model where none is given; 'auto': SIMPLE_RADIAL, OPENCV_FISHEYE if the lens is one."""
 
     use_exif_focal: bool = True
     """Whether focal lengths start from EXIF and COLMAP's sensor database, unless an image was cropped."""

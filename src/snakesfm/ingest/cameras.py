@@ -20,6 +20,8 @@ Sharing = Literal["auto", "exif", "single", "per_folder", "per_image"]
 MODELS_OF_ONE_SIZE = 5
 # images without EXIF are of one camera where at most one size comes with so many images
 IMAGES_PER_SIZE = 20
+# 'auto' begins with it; adjust_bundle takes a wider model where a lens needs one
+FIRST_MODEL = "SIMPLE_RADIAL"
 
 
 @dataclass(frozen=True)
@@ -71,7 +73,7 @@ def assign_cameras(
     photographs : the images.
     known : the image's known intrinsics, or None; equal ones are one camera.
     sharing : which of the other images share a camera; see :func:`group_images`.
-    model : COLMAP camera model of the cameras that are not known.
+    model : COLMAP camera model of the cameras that are not known; ``auto`` begins with SIMPLE_RADIAL.
     default_focal_ratio : focal length as a multiple of the longer side where nothing is known.
     use_exif : whether EXIF focal lengths are used.
     """
@@ -96,7 +98,8 @@ def assign_cameras(
         focal, source = _initial_focal(
             stated[rows], cropped[rows], default_focal_ratio * max(first.width, first.height)
         )
-        cameras.append(given or _create_camera(model, first.width, first.height, focal, source))
+        chosen = FIRST_MODEL if model == "auto" else model
+        cameras.append(given or _create_camera(chosen, first.width, first.height, focal, source))
     return ImageCameras(cameras, camera_ids, np.where(cropped, np.nan, stated))
 
 

@@ -144,7 +144,11 @@ def _adjust(
     )
     shared = options.model_dump(include=set(RoundSettings.__dataclass_fields__))
     shared["min_track_length"] = min(options.min_track_length, max(2, int(poses.registered.sum())))
-    settings = RoundSettings(**shared, seed=job.seed_for("bundle"))
+    settings = RoundSettings(
+        **shared,
+        widen_lenses=job.settings.get("camera_model") == "auto" and options.refine_distortion,
+        seed=job.seed_for("bundle"),
+    )
     refines = options.refine_keypoints
     if refines == "auto":
         refines = most_share_a_camera(index.camera_ids)

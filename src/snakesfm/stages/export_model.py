@@ -23,6 +23,7 @@ from snakesfm.export.nerfstudio import camera_warnings, transforms
 from snakesfm.export.undistorted import write_undistorted
 from snakesfm.geometry.camera import Camera, cameras_from_columns
 from snakesfm.geometry.earth import local_origin
+from snakesfm.geometry.lens_fit import MAX_MISFIT, fit_lenses
 from snakesfm.geometry.poses import center_of, translation_of
 from snakesfm.ingest.masks import masks_as_large
 from snakesfm.stages.job import StageJob
@@ -51,6 +52,14 @@ MISSING_MASKS = (
 
 REFUSED = "{count} image files could not be used (all in the report): {first}"
 
+OTHER_LENS = (
+    "camera {camera} ({model}): errors follow the distance from the principal point, so its lens has "
+    "another distortion: another index_images.camera_model (RADIAL, OPENCV) or other intrinsics may fit it."
+)
+
+# more of them tell no more of a lens
+OBSERVATIONS_OF_LENSES = 500_000
+
 NO_PLACE = "georeference is true, but fewer than four registered images tell their position in EXIF."
 
 
@@ -64,6 +73,7 @@ def run(job: StageJob) -> None:
     registered = registered_images(model.rotations, model.translations)
     used = sorted({int(index.camera_ids[row]) for row in registered})
     warnings = [line for row in used for line in camera_warnings(cameras[row], row + 1)]
+    warnings += _lens_warnings(model, cameras, index.camera_ids)
     if any(" " in names[row] for row in registered):
         warnings.append(SPACES)
     others = other_model_sizes(adjusted.models)
@@ -112,6 +122,22 @@ def run(job: StageJob) -> None:
         for former in (folder / "sparse").glob("[1-9]*"):
             shutil.rmtree(former)
         _publish(temporary, folder)
+
+
+def _lens_warnings(model: Reconstruction, cameras: list[Camera], camera_ids: np.ndarray) -> list[str]:
+    """One sentence per camera whose lens is not of its model."""
+    some = slice(None, None, -(-len(model.image_ids) // OBSERVATIONS_OF_LENSES) or 1)
+    images = model.image_ids[some]
+    points = model.points[np.repeat(np.arange(len(model.points)), np.diff(model.offsets))[some]]
+    in_camera = np.einsum("lij,lj->li", model.rotations[images], points) + model.translations[images]
+    fits = fit_lenses(
+        dict(enumerate(cameras)), camera_ids[images], images, in_camera, model.keypoints[some]
+    )
+    return [
+        OTHER_LENS.format(camera=row + 1, model=cameras[row].model)
+        for row, fit in fits.items()
+        if fit.misfit > MAX_MISFIT
+    ]
 
 
 def _masks(job: StageJob, cameras: dict[str, Camera], warnings: list[str]) -> dict[str, str]:

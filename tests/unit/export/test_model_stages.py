@@ -1,6 +1,7 @@
 """export_model, evaluate_model and render_report on small artifacts with exact truth."""
 
 import csv
+import dataclasses
 import json
 import struct
 from collections.abc import Iterable
@@ -316,6 +317,17 @@ def test_an_image_that_exif_turns_is_shown_as_it_is_stored(tmp_path, problem) ->
     assert (folder / "images" / NAMES[1]).is_symlink()
     export(tmp_path, problem)
     assert (folder / "images").is_symlink()
+
+
+@pytest.mark.parametrize(("distortion", "told"), [(0.02, 0), (0.3, 1)])
+def test_a_lens_of_another_distortion_is_warned_of(tmp_path, distortion: float, told: int) -> None:
+    lens = dataclasses.replace(CAMERA, params=(*CAMERA.params[:3], distortion))
+    seen = make_problem(camera_count=COUNT, point_count=3000, noise_px=0.1, camera=lens)
+    summary = json.loads((export(tmp_path, seen, lost=()) / "summary.json").read_text("utf-8"))
+    # the second camera has but four images
+    found = [line for line in summary["warnings"] if "has another distortion" in line]
+    assert len(found) == told
+    assert all(line.startswith("camera 1 (SIMPLE_RADIAL)") for line in found)
 
 
 def test_masks_go_with_the_images_where_all_have_one_of_their_size(tmp_path, problem) -> None:

@@ -47,6 +47,11 @@ def test_other_lens_focal_length_or_body_is_another_camera(change):
     assert found.camera_ids.tolist() == [0, 0, 1, 1]
 
 
+def test_auto_begins_with_one_term_of_distortion():
+    (camera,) = assign(photos("a", [(1280, 720)] * 3), model="auto").cameras
+    assert camera.model == "SIMPLE_RADIAL"
+
+
 def test_video_without_exif_shares_one_default_camera_per_folder():
     found = assign(photos("a", [(1280, 720)] * 3) + photos("b", [(640, 480)] * 2))
     assert found.camera_ids.tolist() == [0, 0, 0, 1, 1]

@@ -1,0 +1,101 @@
+"""A wider camera model where a lens has another distortion than its camera's model."""
+
+from collections.abc import Collection
+from dataclasses import replace
+from typing import Any
+
+import cv2  # noqa: F401 - must be loaded before pycolmap, whose PNG library clashes otherwise
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from snakesfm.bundle.interface import BundleAdjuster, SolverSettings
+from snakesfm.bundle.reading import observations_of, observed_keypoints
+from snakesfm.geometry.camera import Camera
+from snakesfm.geometry.lens_fit import MAX_MISFIT, LensFit, fit_lenses
+
+Array = NDArray[Any]
+
+WIDER_MODEL = "OPENCV_FISHEYE"
+"""It has four terms of the angle, so it describes perspective lenses with strong distortion, too."""
+NOISE_SHARE = 0.5
+"""Of the errors, what a wider model must leave at most: a better fit alone may be a bent model."""
+COARSE = 300.0
+RADII = 10
+# more points tell no more of a lens, and cost time
+MAX_POINTS = 10_000
+
+
+def find_wider_lenses(
+    reconstruction: pycolmap.Reconstruction,
+    adjust: BundleAdjuster,
+    solving: SolverSettings,
+    candidates: Collection[int],
+) -> dict[int, Camera]:
+    """Cameras by id whose lens is not of their model, with a model and parameters that fit better.
+
+    Parameters
+    ----------
+    reconstruction : an adjusted model with free distortion; stays as it is.
+    adjust, solving : the solver.
+    candidates : ids of the cameras that may change.
+    """
+    before = _fits(reconstruction, candidates)
+    doubtful = [camera_id for camera_id, fit in before.items() if fit.misfit > MAX_MISFIT]
+    if not doubtful:
+        return {}
+    model = pycolmap.Reconstruction(reconstruction)
+    points = sorted(model.point3D_ids())
+    for point in set(points).difference(points[:: -(-len(points) // MAX_POINTS)]):
+        model.delete_point3D(point)
+    for camera_id in doubtful:
+        set_camera(model, camera_id, _as_fisheye(model.camera(camera_id)))
+    adjust(model, replace(solving, function_tolerance=solving.function_tolerance * COARSE))
+    after = _fits(model, doubtful)
+    return {
+        camera_id: _camera_of(model.camera(camera_id))
+        for camera_id in doubtful
+        if camera_id in after and after[camera_id].noise_px < NOISE_SHARE * before[camera_id].noise_px
+    }
+
+
+def set_camera(reconstruction: pycolmap.Reconstruction, camera_id: int, camera: Camera) -> None:
+    """Give a camera another model and parameters."""
+    target = reconstruction.camera(camera_id)
+    target.model = getattr(pycolmap.CameraModelId, camera.model)
+    target.params = list(camera.params)
+
+
+def _fits(reconstruction: pycolmap.Reconstruction, camera_ids: Collection[int]) -> dict[int, LensFit]:
+    if not camera_ids:
+        return {}
+    points, point_of, images, rows = observations_of(reconstruction)
+    camera_of, in_camera = np.empty(len(images), dtype=np.int64), np.empty((len(images), 3))
+    order = np.argsort(images, kind="stable")
+    seen, starts = np.unique(images[order], return_index=True)
+    for image, mine in zip(seen.tolist(), np.split(order, starts[1:]), strict=True):
+        shot = reconstruction.image(image + 1)
+        camera_of[mine] = shot.camera_id
+        in_camera[mine] = shot.cam_from_world() * points[point_of[mine]]
+    keypoints = observed_keypoints(reconstruction, images, rows)
+    cameras = {camera_id: _camera_of(reconstruction.camera(camera_id)) for camera_id in camera_ids}
+    return fit_lenses(cameras, camera_of, images, in_camera, keypoints)
+
+
+def _as_fisheye(camera: pycolmap.Camera) -> Camera:
+    """A fisheye camera without distortion whose rays are near those of a camera, over the image's width."""
+    focals, center = camera.focal_length_idxs(), camera.principal_point_idxs()
+    x, y = (float(camera.params[k]) for k in center)
+    radii = np.linspace(0.05, 0.5, RADII) * max(camera.width, camera.height)
+    rays = np.asarray(camera.cam_from_img(np.column_stack([x + radii, np.full(RADII, y)])))
+    angles = np.arctan(np.linalg.norm(rays, axis=1))
+    usable = np.isfinite(angles) & (angles > 0)
+    focal = float(camera.params[focals[0]])
+    if usable.any():
+        focal = float((radii * angles)[usable].sum() / np.square(angles[usable]).sum())
+    return Camera(WIDER_MODEL, camera.width, camera.height, (focal, focal, x, y, 0.0, 0.0, 0.0, 0.0))
+
+
+def _camera_of(camera: pycolmap.Camera) -> Camera:
+    params = tuple(float(value) for value in camera.params)
+    return Camera(camera.model_name, camera.width, camera.height, params)

@@ -1,0 +1,71 @@
+"""Whether a camera's distortion is that of its lens."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from snakesfm.geometry.camera import Camera
+
+Array = NDArray[Any]
+
+MAX_MISFIT = 0.2
+"""Models that fit have 0.01 to 0.13."""
+ANNULI = 10
+MIN_OBSERVATIONS = 500
+MIN_IMAGES = 5
+# of exact keypoints no error is left but that of the solver
+LEAST_NOISE_PX = 0.01
+
+
+@dataclass(frozen=True)
+class LensFit:
+    """How well a camera's model describes its lens.
+
+    Parameters
+    ----------
+    misfit : how much of the reprojection errors follows the distance from the principal point, 0 where the
+        distortion is the lens's: the root mean square over ten annuli, of as many observations each, of the
+        median error along the radius, in ``noise_px``.
+    noise_px : robust standard deviation of the errors across the radius.
+    """
+
+    misfit: float
+    noise_px: float
+
+
+def fit_lenses(
+    cameras: Mapping[int, Camera], camera_of: Array, images: Array, in_camera: Array, keypoints: Array
+) -> dict[int, LensFit]:
+    """How well the models of cameras describe their lenses, by the cameras' numbers.
+
+    Parameters
+    ----------
+    cameras : those that are asked for, by any number.
+    camera_of : (L,) these numbers of the observations.
+    images : (L,) image of each observation; cameras with fewer than five are left out, as are those with
+        fewer than 500 observations.
+    in_camera : (L,3) observed points in the frames of their images' cameras.
+    keypoints : (L,2) pixels of the observations.
+    """
+    fits = {}
+    for number, camera in cameras.items():
+        rows = np.flatnonzero(camera_of == number)
+        if len(rows) >= MIN_OBSERVATIONS and len(np.unique(images[rows])) >= MIN_IMAGES:
+            fits[number] = _fit(camera, in_camera[rows], keypoints[rows])
+    return fits
+
+
+def _fit(camera: Camera, in_camera: Array, keypoints: Array) -> LensFit:
+    model = camera.to_pycolmap()
+    errors = keypoints - np.asarray(model.img_from_cam(in_camera))
+    offsets = keypoints - [model.params[k] for k in model.principal_point_idxs()]
+    radii = np.linalg.norm(offsets, axis=1)
+    outward = offsets / np.maximum(radii, 1e-9)[:, None]
+    along = (errors * outward).sum(axis=1)
+    across = errors[:, 1] * outward[:, 0] - errors[:, 0] * outward[:, 1]
+    noise_px = max(1.4826 * float(np.nanmedian(np.abs(across))), LEAST_NOISE_PX)
+    medians = [np.nanmedian(part) for part in np.array_split(along[np.argsort(radii)], ANNULI)]
+    return LensFit(float(np.sqrt(np.mean(np.square(medians)))) / noise_px, noise_px)

@@ -1,0 +1,69 @@
+"""Cameras whose lens is not of their model get a wider one; all others keep theirs."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from synthetic_scene import run_rounds, true_model
+
+from snakesfm.bundle.interface import SolverSettings
+from snakesfm.geometry.camera import Camera
+from snakesfm.geometry.rotations import angle_of
+from snakesfm.synthetic.problems import Layout, make_problem
+
+SIZE = (640, 480)
+CENTER = (320.0, 240.0)
+FISHEYE = Camera("OPENCV_FISHEYE", *SIZE, (250.0, 250.0, *CENTER, 0.01, 0.0, 0.0, 0.0))
+START = Camera("SIMPLE_RADIAL", *SIZE, (300.0, *CENTER, 0.0), "estimated")
+RADIAL = Camera("SIMPLE_RADIAL", *SIZE, (280.0, *CENTER, -0.05))
+
+
+def adjusted(
+    true: Camera,
+    start: Camera = START,
+    held: frozenset[int] = frozenset(),
+    layout: Layout = "facade",
+    **changes: object,
+):
+    """What rounds make of keypoints of a true camera: the camera, the rounds' names and the largest error."""
+    made = make_problem(14, 900, layout=layout, noise_px=0.05, camera=true, seed=3)
+    model = replace(true_model(made), cameras=(start,))
+    settings = {"widen_lenses": True, "refine_principal_points": False} | changes
+    found, records = run_rounds(made, model, SolverSettings(constant_cameras=held), **settings)
+    relative = found.rotations[1:] @ found.rotations[:-1].transpose(0, 2, 1)
+    truth = made.rotations[1:] @ made.rotations[:-1].transpose(0, 2, 1)
+    errors_deg = np.degrees(angle_of(relative @ truth.transpose(0, 2, 1)))
+    return found.cameras[0], [record.name for record in records], float(errors_deg.max())
+
+
+def test_a_fisheye_lens_is_found_out_and_the_model_is_right() -> None:
+    camera, names, error_deg = adjusted(FISHEYE)
+    assert (camera.model, camera.source) == ("OPENCV_FISHEYE", "estimated")
+    assert camera.params[0] == pytest.approx(250.0, rel=0.003)
+    assert names.count("round 2 with wider lenses") == 1
+    *_, narrow_deg = adjusted(FISHEYE, widen_lenses=False)
+    assert error_deg < 0.03 < 0.3 < narrow_deg
+
+
+@pytest.mark.parametrize(
+    "case",
+    [
+        {"true": RADIAL},
+        # of points within 45 degrees of the axis the wider model leaves more than half of the errors
+        {"true": FISHEYE, "layout": "ring"},
+        {"true": FISHEYE, "held": frozenset([1])},
+        {"true": FISHEYE, "distortion_from_round": 3},
+        {"true": FISHEYE, "widen_lenses": False},
+    ],
+    ids=["its own", "hardly better", "held", "distortion still held", "switched off"],
+)
+def test_other_lenses_keep_their_model(case) -> None:
+    camera, names, _ = adjusted(**case)
+    assert camera.model == "SIMPLE_RADIAL"
+    assert not any("lenses" in name for name in names)
+
+
+def test_a_lens_gone_wild_later_goes_back_to_the_wider_model() -> None:
+    camera, names, _ = adjusted(FISHEYE, max_distortion=1e-9)
+    assert "round 2 with wider lenses" in names
+    assert (camera.model, len(camera.params)) == ("OPENCV_FISHEYE", 8)
