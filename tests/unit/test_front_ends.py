@@ -176,7 +176,7 @@ def test_stages_after_matching_are_told_how_large_the_detector_saw_the_images(
         assert {name: value for name, value in told.items() if name.startswith("detector_")} == expected
 
 
-def test_masks_reach_extraction_alone_and_their_content_counts(tmp_path: Path) -> None:
+def test_masks_reach_extraction_and_export_and_their_content_counts(tmp_path: Path) -> None:
     masks = tmp_path / "masks"
     masks.mkdir()
     (masks / "1.jpg.png").write_bytes(b"mask")
@@ -185,7 +185,7 @@ def test_masks_reach_extraction_alone_and_their_content_counts(tmp_path: Path) -
     wildcards = {"block": "0", "tile": "0-0"}
     for stage in STAGES:
         same = scene.params(stage, wildcards, True) == before.params(stage, wildcards, True)
-        assert same == (stage != "extract_features")
+        assert same == (stage not in ("extract_features", "export_model"))
     (masks / "1.jpg.png").write_bytes(b"another mask")
     (changed,) = plan_of(tmp_path, masks=str(masks)).scenes.values()
     told = [plan.settings("extract_features", wildcards, True) for plan in (scene, changed)]

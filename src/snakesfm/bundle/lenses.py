@@ -10,6 +10,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from snakesfm.bundle.interface import BundleAdjuster, SolverSettings
+from snakesfm.bundle.principal_points import shared_cameras
 from snakesfm.bundle.reading import observations_of, observed_keypoints
 from snakesfm.geometry.camera import Camera
 from snakesfm.geometry.lens_fit import MAX_MISFIT, LensFit, fit_lenses
@@ -30,17 +31,15 @@ def find_wider_lenses(
     reconstruction: pycolmap.Reconstruction,
     adjust: BundleAdjuster,
     solving: SolverSettings,
-    candidates: Collection[int],
 ) -> dict[int, Camera]:
     """Cameras by id whose lens is not of their model, with a model and parameters that fit better.
 
     Parameters
     ----------
     reconstruction : an adjusted model with free distortion; stays as it is.
-    adjust, solving : the solver.
-    candidates : ids of the cameras that may change.
+    adjust, solving : the solver; cameras that it holds, or of few images, are no candidates.
     """
-    before = _fits(reconstruction, candidates)
+    before = _fits(reconstruction, shared_cameras(reconstruction, solving.constant_cameras))
     doubtful = [camera_id for camera_id, fit in before.items() if fit.misfit > MAX_MISFIT]
     if not doubtful:
         return {}
@@ -73,7 +72,8 @@ def _fits(reconstruction: pycolmap.Reconstruction, camera_ids: Collection[int]) 
     camera_of, in_camera = np.empty(len(images), dtype=np.int64), np.empty((len(images), 3))
     order = np.argsort(images, kind="stable")
     seen, starts = np.unique(images[order], return_index=True)
-    for image, mine in zip(seen.tolist(), np.split(order, starts[1:]), strict=True):
+    # of nothing there is one part, of no number
+    for image, mine in zip(seen.tolist(), np.split(order, starts[1:]), strict=False):
         shot = reconstruction.image(image + 1)
         camera_of[mine] = shot.camera_id
         in_camera[mine] = shot.cam_from_world() * points[point_of[mine]]

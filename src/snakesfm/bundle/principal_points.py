@@ -42,7 +42,7 @@ def find_told_cameras(
     offsets : smallest and largest distance from the principal point so far, likewise; it must be three gaps
         too. Both halves share what the model as a whole gets wrong, so small distances prove nothing.
     """
-    candidates = _candidates(reconstruction, solving.constant_cameras)
+    candidates = shared_cameras(reconstruction, solving.constant_cameras)
     if not candidates:
         return frozenset()
     held = frozenset(reconstruction.cameras) - candidates
@@ -66,7 +66,8 @@ def principal_point(camera: pycolmap.Camera) -> Array:
     return np.array([camera.params[k] for k in camera.principal_point_idxs()])
 
 
-def _candidates(reconstruction: pycolmap.Reconstruction, held: frozenset[int]) -> frozenset[int]:
+def shared_cameras(reconstruction: pycolmap.Reconstruction, held: frozenset[int]) -> frozenset[int]:
+    """Ids of the cameras of five registered images or more, but for those that are held."""
     of_images: Sequence[int] = [reconstruction.image(i).camera_id for i in reconstruction.reg_image_ids()]
     ids, counts = np.unique(np.array(of_images, dtype=np.int64), return_counts=True)
     return frozenset(ids[counts >= MIN_IMAGES].tolist()) - held

@@ -238,9 +238,8 @@ class _Mapper:
         told = len(self.records) >= settings.distortion_from_round
         if not settings.widen_lenses or not told or settings.solver != "ceres":
             return False
-        free = frozenset(self.reconstruction.cameras) - self.solving.constant_cameras
         solving = replace(self.solving, loss_scale_px=self.loss_scale_px())
-        wider = find_wider_lenses(self.reconstruction, self.adjust, solving, free)
+        wider = find_wider_lenses(self.reconstruction, self.adjust, solving)
         for camera_id, camera in wider.items():
             set_camera(self.reconstruction, camera_id, camera)
             # what went wild later would else go back to the former model

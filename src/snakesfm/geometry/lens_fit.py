@@ -50,11 +50,17 @@ def fit_lenses(
     in_camera : (L,3) observed points in the frames of their images' cameras.
     keypoints : (L,2) pixels of the observations.
     """
+    order = np.argsort(camera_of, kind="stable")
+    numbers, starts = np.unique(camera_of[order], return_index=True)
     fits = {}
-    for number, camera in cameras.items():
-        rows = np.flatnonzero(camera_of == number)
-        if len(rows) >= MIN_OBSERVATIONS and len(np.unique(images[rows])) >= MIN_IMAGES:
-            fits[number] = _fit(camera, in_camera[rows], keypoints[rows])
+    # of nothing there is one part, of no number
+    for number, rows in zip(numbers.tolist(), np.split(order, starts[1:]), strict=False):
+        if (
+            number in cameras
+            and len(rows) >= MIN_OBSERVATIONS
+            and len(np.unique(images[rows])) >= MIN_IMAGES
+        ):
+            fits[number] = _fit(cameras[number], in_camera[rows], keypoints[rows])
     return fits
 
 
