@@ -1,11 +1,12 @@
 """A set of photographs as large as cameras take them, with exact truth, for ``benchmarks.compare``.
 
-    python -m benchmarks.large_photographs DATA [--images 24] [--width 4000] [--seed 0]
+    python -m benchmarks.large_photographs DATA [--images 24] [--width 4000] [--seed 0] [--fisheye DEGREES]
 
 The image sets at hand are scaled to 760 pixels. DATA/courtyard_WIDTH holds a rendered courtyard instead:
 three walls, a floor and four blocks, seen along an arc. Its surfaces are covered by leaves (discs, ellipses
 and boxes) from the size of a pixel up to a metre, much like dead leaves, which have the statistics of
 photographs (Lee, Mumford and Huang 2001): there is about as much to see at any size of the image.
+With --fisheye the lens is an equidistant one, and the folder's name says so.
 """
 
 import argparse
@@ -34,6 +35,8 @@ LEAVES_PER_TEXEL = 1 / 45
 LEAF_RADII = (1.2, 400.0)
 # how far the order in which leaves fall departs from the largest first, in logarithms of the radius
 DISORDER = 0.45
+# beyond, the corners of an image look sideways, which no pinhole shows
+MOST_DEGREES = 130.0
 META = "reference_source: rendered\nknown_intrinsics: true\n"
 # x, y of the middle, side and height of the blocks in metres
 BLOCKS = ((-2.5, 1.5, 1.3, 1.6), (1.5, 2.5, 1.0, 2.4), (3.0, 0.5, 1.2, 1.0), (-0.5, 0.2, 0.8, 0.7))
@@ -90,12 +93,26 @@ def build_courtyard(seed: int, texels_per_metre: float) -> list[Face]:
     return faces
 
 
-def place_views(seed: int, count: int, width: int) -> dict[str, View]:
-    """Views (3:2) along an arc in front of the courtyard, each turned a little."""
-    rng = np.random.default_rng(derive_seed(seed, "courtyard", "views"))
+def pinhole(width: int) -> Camera:
+    """A camera of 3:2 without distortion."""
     height = width * 2 // 3
     focal = FOCAL_35MM / 36.0 * width
-    camera = Camera("PINHOLE", width, height, (focal, focal, width / 2, height / 2))
+    return Camera("PINHOLE", width, height, (focal, focal, width / 2, height / 2))
+
+
+def fisheye(width: int, degrees: float) -> tuple[Camera, Camera]:
+    """An equidistant lens of 3:2 that sees so many degrees across, and a pinhole that sees as much."""
+    height = width * 2 // 3
+    focal = width / np.radians(degrees)
+    lens = (focal, focal, width / 2, height / 2, 0.0, 0.0, 0.0, 0.0)
+    side = 2 * int(focal * np.tan(np.hypot(width, height) / 2 / focal)) + 4
+    square = (focal, focal, side / 2, side / 2)
+    return Camera("OPENCV_FISHEYE", width, height, lens), Camera("PINHOLE", side, side, square)
+
+
+def place_views(seed: int, count: int, camera: Camera) -> dict[str, View]:
+    """Views along an arc in front of the courtyard, each turned a little."""
+    rng = np.random.default_rng(derive_seed(seed, "courtyard", "views"))
     views = {}
     for number, along in enumerate(np.linspace(-0.5, 0.5, count)):
         offset = rng.uniform((-0.3, -0.8, -0.4), (0.3, 0.8, 0.8))
@@ -113,16 +130,23 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("--images", type=int, default=24)
     parser.add_argument("--width", type=int, default=4000, help="in pixels; the height is two thirds of it")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--fisheye", type=float, metavar="DEGREES", help=f"at most {MOST_DEGREES:.0f}")
     given = parser.parse_args(arguments)
     cv2.setNumThreads(1)
-    folder = given.data / f"courtyard_{given.width}"
+    bent = f"_fisheye_{given.fisheye:.0f}" if given.fisheye else ""
+    folder = given.data / f"courtyard_{given.width}{bent}"
+    if given.fisheye and not 10.0 <= given.fisheye <= MOST_DEGREES:
+        sys.stderr.write(f"--fisheye is {given.fisheye:.0f}: give 10 to {MOST_DEGREES:.0f} degrees.\n")
+        return 1
     if folder.exists():
         sys.stderr.write(f"{folder} is there already: remove it or name another folder.\n")
         return 1
     faces = build_courtyard(given.seed, given.width * TEXELS_PER_METRE)
     points = sample_points(faces, POINTS, given.seed)
-    views = place_views(given.seed, given.images, given.width)
-    write_scene(folder, faces, views, points, given.seed, FOCAL_35MM, samples=1, blur_px=BLUR_PX)
+    lens, camera = fisheye(given.width, given.fisheye) if given.fisheye else (None, pinhole(given.width))
+    views = place_views(given.seed, given.images, camera)
+    focal_35mm = 36.0 * (lens or camera).params[0] / given.width
+    write_scene(folder, faces, views, points, given.seed, focal_35mm, samples=1, blur_px=BLUR_PX, lens=lens)
     (folder / "meta.yaml").write_text(META, "utf-8")
     sys.stdout.write(f"{given.images} images in {folder / 'images'}\n")
     return 0

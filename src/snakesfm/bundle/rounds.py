@@ -36,6 +36,9 @@ LONG_LENS_SHARE = 0.5
 # early rounds come before all observations are there, final ones after, the last of which is exact
 Phase = Literal["early", "final", "last"]
 
+# a pass may take so many steps times observations, about a second, in whatever many steps
+CHEAP_STEPS = 2_000_000
+MOST_STEPS = 500
 # of exact keypoints the model shows no noise but that of float32 and of the solver
 EXACT_PX = 0.05
 
@@ -73,6 +76,7 @@ class RoundSettings:
     select_above_images: int = 500
     early_observations: int = 300
     final_observations: int = 0
+    patient: bool = False
     seed: int = 0
 
 
@@ -265,6 +269,10 @@ class _Mapper:
     def solve(self, solving: SolverSettings, phase: Phase) -> tuple[float, float]:
         """One pass of the solver, in large models on as many observations as the settings say."""
         settings = self.settings
+        if settings.patient:
+            cheap = CHEAP_STEPS // max(self.reconstruction.compute_num_observations(), 1)
+            steps = max(solving.max_iterations, min(cheap, MOST_STEPS))
+            solving = replace(solving, max_iterations=steps)
         per_image = settings.early_observations if phase == "early" else settings.final_observations
         if not per_image or self.reconstruction.num_reg_images() <= settings.select_above_images:
             return self.adjust(self.reconstruction, solving)

@@ -123,8 +123,8 @@ class AdjustBundleOptions(StageOptions):
     final_observations: int = Field(default=0, ge=0)
     """The same in the last round and later ones; 0 for all."""
 
-    max_iterations: int = Field(default=50, ge=1)
-    """Iterations of the solver per pass."""
+    max_iterations: Literal["auto"] | Annotated[int, Field(ge=1)] = "auto"
+    """Iterations of the solver per pass; 'auto' is 50, up to 500 where a small model makes them cheap."""
 
     function_tolerance: float = Field(default=3e-6, gt=0.0)
     """Relative decrease of the cost at which the last pass ends; earlier ones end at 300 times as much."""

@@ -47,6 +47,7 @@ if TYPE_CHECKING:
     from snakesfm.config.adjust_bundle import AdjustBundleOptions
 
 SMALLEST_FURTHER_MODEL = 3
+USUAL_ITERATIONS = 50
 
 
 def run(job: StageJob) -> None:
@@ -139,13 +140,14 @@ def _adjust(
         constant_cameras=frozenset(row + 1 for row in held),
         refine_focal=options.refine_focal,
         refine_distortion=options.refine_distortion,
-        max_iterations=options.max_iterations,
+        max_iterations=USUAL_ITERATIONS if options.max_iterations == "auto" else options.max_iterations,
         function_tolerance=options.function_tolerance,
     )
     shared = options.model_dump(include=set(RoundSettings.__dataclass_fields__))
     shared["min_track_length"] = min(options.min_track_length, max(2, int(poses.registered.sum())))
     settings = RoundSettings(
         **shared,
+        patient=options.max_iterations == "auto",
         widen_lenses=job.settings.get("camera_model") == "auto" and options.refine_distortion,
         seed=job.seed_for("bundle"),
     )

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from snakesfm.errors import ConfigError, SnakesfmError
 from snakesfm.export.colmap import build_reconstruction
+from snakesfm.geometry.camera import Camera
 from snakesfm.seeding import derive_seed
 from snakesfm.synthetic.raster import Face, View, render
 from snakesfm.synthetic.scene import DemoOptions, build_scene, camera_path, sample_points, sky
@@ -87,6 +88,7 @@ def write_scene(
     focal_35mm: float,
     samples: int = SAMPLES,
     blur_px: float = 0.0,
+    lens: Camera | None = None,
 ) -> None:
     """Write images/ and reference/ of a scene.
 
@@ -98,15 +100,22 @@ def write_scene(
     focal_35mm : focal length that EXIF tells.
     samples : samples per pixel along each axis.
     blur_px : standard deviation of the lens's blur; 0 for none.
+    lens : what the photographs are taken with in place of the views' pinhole, which must show as much.
     """
     (folder / "images").mkdir(parents=True)
     (folder / "reference").mkdir()
     seen, pixels, colors = [], [], []
     for name, view in views.items():
         image, inverse_depth = render(faces, view, sky(view, samples), samples)
+        visible, places = visible_points(points, view, inverse_depth, samples)
+        if lens is not None:
+            image = bend(image, view.camera, lens)
+            places = np.asarray(
+                lens.to_pycolmap().img_from_cam(points @ view.rotation.T + view.translation)
+            )
+            visible &= np.all((places >= 0) & (places < (lens.width, lens.height)), axis=1)
         if blur_px > 0:
             image = cv2.GaussianBlur(image, (0, 0), blur_px)
-        visible, places = visible_points(points, view, inverse_depth, samples)
         inside = np.where(visible[:, None], places, 0).astype(int)
         colors.append(np.where(visible[:, None], image[inside[:, 1], inside[:, 0]], np.nan))
         rng = np.random.default_rng(derive_seed(seed, "demo", "noise", name))
@@ -114,7 +123,19 @@ def write_scene(
         _write_photo(folder / "images" / name, np.clip(np.rint(noisy), 0, 255).astype(np.uint8), focal_35mm)
         seen.append(visible)
         pixels.append(places)
-    _write_reference(folder / "reference", views, points, (seen, pixels, colors))
+    camera = lens or next(iter(views.values())).camera
+    _write_reference(folder / "reference", camera, views, points, (seen, pixels, colors))
+
+
+def bend(image: Array, pinhole: Camera, lens: Camera) -> Array:
+    """The image (H,W,3) float32 of a pinhole camera as another lens shows it; black where it shows more."""
+    columns, rows = np.meshgrid(np.arange(lens.width) + 0.5, np.arange(lens.height) + 0.5)
+    rays = lens.normalize(np.column_stack([columns.ravel(), rows.ravel()]))
+    seen = np.asarray(pinhole.to_pycolmap().img_from_cam(np.column_stack([rays, np.ones(len(rays))])))
+    # OpenCV counts from the middle of the first pixel
+    x, y = (seen - 0.5).astype(np.float32).T.reshape(2, lens.height, lens.width)
+    bent: Array = cv2.remap(image, x, y, cv2.INTER_LINEAR)
+    return bent
 
 
 def _write_photo(path: Path, image: Array, focal_35mm: float) -> None:
@@ -131,6 +152,7 @@ def _write_photo(path: Path, image: Array, focal_35mm: float) -> None:
 
 def _write_reference(
     folder: Path,
+    camera: Camera,
     views: Mapping[str, View],
     points: Array,
     observed: tuple[Sequence[Array], Sequence[Array], Sequence[Array]],
@@ -141,7 +163,7 @@ def _write_reference(
     model = build_reconstruction(
         list(views),
         np.zeros(len(views), dtype=np.int32),
-        [next(iter(views.values())).camera],
+        [camera],
         np.array([view.rotation for view in views.values()]),
         np.array([view.translation for view in views.values()]),
         points[kept],

@@ -15,7 +15,14 @@ IMAGES = 3
 def courtyard(tmp_path_factory: pytest.TempPathFactory):
     folder = tmp_path_factory.mktemp("large")
     assert main([str(folder), "--images", str(IMAGES), "--width", "240"]) == 0
-    return folder
+    return folder / "courtyard_240"
+
+
+@pytest.fixture(scope="module")
+def bent_courtyard(tmp_path_factory: pytest.TempPathFactory):
+    folder = tmp_path_factory.mktemp("bent")
+    assert main([str(folder), "--images", str(IMAGES), "--width", "240", "--fisheye", "110"]) == 0
+    return folder / "courtyard_240_fisheye_110"
 
 
 def test_leaves_show_about_as_much_at_any_size() -> None:
@@ -29,15 +36,19 @@ def test_leaves_show_about_as_much_at_any_size() -> None:
 
 
 def test_the_set_is_one_that_the_comparison_reads(courtyard) -> None:
-    (image_set,) = read_sets(courtyard, [])
+    (image_set,) = read_sets(courtyard.parent, [])
     assert (image_set.name, image_set.known, image_set.truth) == ("courtyard_240", True, True)
     assert len(image_set.image_names()) == IMAGES
 
 
-def test_points_of_the_reference_have_one_color_in_all_images(courtyard) -> None:
-    folder = courtyard / "courtyard_240"
+@pytest.mark.parametrize(
+    ("name", "camera_model"), [("courtyard", "PINHOLE"), ("bent_courtyard", "OPENCV_FISHEYE")]
+)
+def test_points_of_the_reference_have_one_color_in_all_images(name, camera_model, request) -> None:
+    folder = request.getfixturevalue(name)
     model = pycolmap.Reconstruction(str(folder / "reference"))
     assert len(model.images) == IMAGES
+    assert [camera.model_name for camera in model.cameras.values()] == [camera_model]
     assert 200 < len(model.points3D) < 4000
     shown: dict[int, list[np.ndarray]] = {}
     for image in model.images.values():
@@ -56,7 +67,7 @@ def test_the_same_seed_gives_the_same_images_and_nothing_is_overwritten(
 ) -> None:
     arguments = ["--images", str(IMAGES), "--width", "240"]
     assert main([str(tmp_path), *arguments]) == 0
-    first, again = (folder / "courtyard_240" / "images" for folder in (courtyard, tmp_path))
+    first, again = courtyard / "images", tmp_path / "courtyard_240" / "images"
     assert [(again / path.name).read_bytes() == path.read_bytes() for path in first.iterdir()] == [
         True
     ] * IMAGES

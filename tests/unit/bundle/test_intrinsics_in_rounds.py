@@ -96,3 +96,14 @@ def test_only_observations_within_the_noise_take_part_in_the_last_pass(monkeypat
     settings = {"outlier_sigmas": sigmas, "complete_tracks": False, "refine_principal_points": False}
     run_rounds(made, true_model(made), **settings)
     assert len(seen) == 1 and fewest <= seen[0] <= most
+
+
+@pytest.mark.parametrize(
+    ("patient", "cheap", "expected"), [(False, 100_000, 50), (True, 0, 50), (True, 10**9, 500)]
+)
+def test_small_models_may_take_more_steps(patient, cheap, expected, passes, monkeypatch) -> None:
+    monkeypatch.setattr(rounds, "CHEAP_STEPS", cheap)
+    made = make_problem(8, 300, noise_px=0.3, seed=2)
+    settings = {"patient": patient, "refine_principal_points": False}
+    run_rounds(made, true_model(made), SolverSettings(max_iterations=50), **settings)
+    assert [told.max_iterations for told in passes] == [expected] * 4
