@@ -4,7 +4,7 @@ from pathlib import Path
 
 from snakesfm.config.configuration import STAGES
 from snakesfm.errors import ConfigError
-from snakesfm.ingest.discover import count_images, list_unread, walk_images
+from snakesfm.ingest.discover import count_images, list_photographs, walk_images
 from snakesfm.ingest.masks import find_mask
 from snakesfm.scene_plan import ScenePlan
 
@@ -43,7 +43,7 @@ def _check_images(scene: ScenePlan) -> None:
             "pictures would be taken for photographs: give another output=DIR."
         )
     if count_images(images, 1) == 0:
-        unread = list_unread(images)
+        _, unread = list_photographs(images)
         remedy = (
             f"convert those like '{unread[0]}' to JPEG ({len(unread)} in number)."
             if unread

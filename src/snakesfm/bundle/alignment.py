@@ -16,6 +16,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from snakesfm.grouping import rows_of_each
+
 Array = NDArray[Any]
 
 MAX_MOVE_PX = 1.5
@@ -145,7 +147,7 @@ def align_observations(
 
     # each image writes rows of its own, and OpenCV and numpy run without Python's lock
     with ThreadPoolExecutor(settings.threads) as pool:
-        list(pool.map(cut, _by_image(images[sources], np.arange(len(sources)))))
+        list(pool.map(cut, rows_of_each(images[sources])))
         starts = range(0, len(sources), PATCHES_AT_ONCE)
         inverses = np.concatenate(
             [
@@ -155,15 +157,9 @@ def align_observations(
         )
         usable &= aligned[templates]
         position = np.searchsorted(sources, templates)
-        list(pool.map(align, _by_image(images[usable], np.nonzero(usable)[0])))
+        rows = np.nonzero(usable)[0]
+        list(pool.map(align, [(image, rows[mine]) for image, mine in rows_of_each(images[usable])]))
     return moved, aligned
-
-
-def _by_image(images: Array, rows: Array) -> list[tuple[int, Array]]:
-    """The rows of each image, of ``rows`` whose images are ``images``."""
-    order = np.argsort(images, kind="stable")
-    found, starts = np.unique(images[order], return_index=True)
-    return list(zip(found.tolist(), np.split(rows[order], starts[1:]), strict=True)) if len(order) else []
 
 
 def _grid(radius: int) -> tuple[Array, Array]:

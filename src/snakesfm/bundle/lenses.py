@@ -1,7 +1,6 @@
 """A wider camera model where a lens has another distortion than its camera's model."""
 
 from collections.abc import Collection
-from dataclasses import replace
 from typing import Any
 
 import cv2  # noqa: F401 - must be loaded before pycolmap, whose PNG library clashes otherwise
@@ -14,6 +13,7 @@ from snakesfm.bundle.principal_points import shared_cameras
 from snakesfm.bundle.reading import observations_of, observed_keypoints
 from snakesfm.geometry.camera import Camera
 from snakesfm.geometry.lens_fit import MAX_MISFIT, LensFit, fit_lenses
+from snakesfm.grouping import rows_of_each
 
 Array = NDArray[Any]
 
@@ -21,7 +21,6 @@ WIDER_MODEL = "OPENCV_FISHEYE"
 """It has four terms of the angle, so it describes perspective lenses with strong distortion, too."""
 NOISE_SHARE = 0.5
 """Of the errors, what a wider model must leave at most: a better fit alone may be a bent model."""
-COARSE = 300.0
 RADII = 10
 # more points tell no more of a lens, and cost time
 MAX_POINTS = 10_000
@@ -49,10 +48,10 @@ def find_wider_lenses(
         model.delete_point3D(point)
     for camera_id in doubtful:
         set_camera(model, camera_id, _as_fisheye(model.camera(camera_id)))
-    adjust(model, replace(solving, function_tolerance=solving.function_tolerance * COARSE))
+    adjust(model, solving)
     after = _fits(model, doubtful)
     return {
-        camera_id: _camera_of(model.camera(camera_id))
+        camera_id: Camera.of_pycolmap(model.camera(camera_id))
         for camera_id in doubtful
         if camera_id in after and after[camera_id].noise_px < NOISE_SHARE * before[camera_id].noise_px
     }
@@ -70,15 +69,12 @@ def _fits(reconstruction: pycolmap.Reconstruction, camera_ids: Collection[int]) 
         return {}
     points, point_of, images, rows = observations_of(reconstruction)
     camera_of, in_camera = np.empty(len(images), dtype=np.int64), np.empty((len(images), 3))
-    order = np.argsort(images, kind="stable")
-    seen, starts = np.unique(images[order], return_index=True)
-    # of nothing there is one part, of no number
-    for image, mine in zip(seen.tolist(), np.split(order, starts[1:]), strict=False):
+    for image, mine in rows_of_each(images):
         shot = reconstruction.image(image + 1)
         camera_of[mine] = shot.camera_id
         in_camera[mine] = shot.cam_from_world() * points[point_of[mine]]
     keypoints = observed_keypoints(reconstruction, images, rows)
-    cameras = {camera_id: _camera_of(reconstruction.camera(camera_id)) for camera_id in camera_ids}
+    cameras = {camera_id: Camera.of_pycolmap(reconstruction.camera(camera_id)) for camera_id in camera_ids}
     return fit_lenses(cameras, camera_of, images, in_camera, keypoints)
 
 
@@ -94,8 +90,3 @@ def _as_fisheye(camera: pycolmap.Camera) -> Camera:
     if usable.any():
         focal = float((radii * angles)[usable].sum() / np.square(angles[usable]).sum())
     return Camera(WIDER_MODEL, camera.width, camera.height, (focal, focal, x, y, 0.0, 0.0, 0.0, 0.0))
-
-
-def _camera_of(camera: pycolmap.Camera) -> Camera:
-    params = tuple(float(value) for value in camera.params)
-    return Camera(camera.model_name, camera.width, camera.height, params)

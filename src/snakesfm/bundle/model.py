@@ -4,7 +4,7 @@ Ids of cameras, images and frames in the reconstruction are rows plus one.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import cv2  # noqa: F401 - must be loaded before pycolmap, whose PNG library clashes otherwise
@@ -100,11 +100,7 @@ def from_reconstruction(reconstruction: pycolmap.Reconstruction, model: BundleMo
     model : gives the cameras' sources and which camera took each image.
     """
     cameras = tuple(
-        replace(
-            camera,
-            model=reconstruction.camera(row + 1).model_name,
-            params=tuple(float(p) for p in reconstruction.camera(row + 1).params),
-        )
+        Camera.of_pycolmap(reconstruction.camera(row + 1), camera.source)
         for row, camera in enumerate(model.cameras)
     )
     rotations = np.full((len(model.camera_ids), 3, 3), np.nan)

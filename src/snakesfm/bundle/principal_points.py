@@ -10,11 +10,10 @@ import pycolmap
 from numpy.typing import NDArray
 
 from snakesfm.bundle.interface import BundleAdjuster, SolverSettings
+from snakesfm.geometry.lens_fit import MIN_IMAGES
 
 Array = NDArray[Any]
 
-# fewer images than this never tell a principal point from the tilt of their poses
-MIN_IMAGES = 5
 # what is no farther than this many gaps from where it is assumed may as well be there
 SIGNIFICANCE = 3.0
 # more points than this tell no more of a few numbers, and cost time

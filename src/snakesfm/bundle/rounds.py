@@ -242,7 +242,11 @@ class _Mapper:
         told = len(self.records) >= settings.distortion_from_round
         if not settings.widen_lenses or not told or settings.solver != "ceres":
             return False
-        solving = replace(self.solving, loss_scale_px=self.loss_scale_px())
+        solving = replace(
+            self.solving,
+            loss_scale_px=self.loss_scale_px(),
+            function_tolerance=self.solving.function_tolerance * EARLY_TOLERANCE,
+        )
         wider = find_wider_lenses(self.reconstruction, self.adjust, solving)
         for camera_id, camera in wider.items():
             set_camera(self.reconstruction, camera_id, camera)

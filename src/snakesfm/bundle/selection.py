@@ -106,10 +106,8 @@ def _part(
         if image.has_pose:
             pose = image.cam_from_world()
             rotations[image_id - 1], translations[image_id - 1] = pose.rotation.matrix(), pose.translation
-    cameras = []
-    for camera_id in range(1, max(reconstruction.cameras) + 1):
-        camera = reconstruction.camera(camera_id)
-        cameras.append(Camera(camera.model_name, camera.width, camera.height, tuple(camera.params)))
+    camera_count = max(reconstruction.cameras)
+    cameras = [Camera.of_pycolmap(reconstruction.camera(row + 1)) for row in range(camera_count)]
     by_image = np.argsort(images, kind="stable")
     bounds = np.searchsorted(images[by_image], np.arange(count + 1))
     keypoint_ids = np.empty(len(images), dtype=np.int64)

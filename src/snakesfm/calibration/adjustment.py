@@ -20,11 +20,11 @@ from snakesfm.calibration.condensed import (
     reduced_equations,
 )
 from snakesfm.calibration.epipolar import EpipolarPair, cameras_of
+from snakesfm.geometry.robust import robust_sigma
 from snakesfm.two_view.estimators import poselib_camera
 from snakesfm.two_view.sampson import (
     Correspondences,
     cauchy_weights,
-    robust_sigma_px,
     sampson_errors_px,
     sampson_jacobian,
 )
@@ -244,7 +244,7 @@ def _reduced(pair: EpipolarPair, pose: tuple[Array, Array], focals: Array) -> tu
     """Normal equations (2,2), (2,) of the log focals without the pose, by the noise of the points."""
     focal_i, focal_j = float(focals[pair.camera_i]), float(focals[pair.camera_j])
     errors, by_pose = sampson_jacobian(correspondences_of(pair, focal_i, focal_j), *pose)
-    sigma = robust_sigma_px(errors, NOISE_FLOOR_PX)
+    sigma = robust_sigma(errors, NOISE_FLOOR_PX)
     weights = cauchy_weights(errors, 2.0 * sigma) / sigma**2
     up = np.exp(LOG_STEP)
     by_focal = np.column_stack(

@@ -8,7 +8,7 @@ import numpy as np
 import poselib
 from numpy.typing import NDArray
 
-from snakesfm.two_view.sampson import robust_sigma_px
+from snakesfm.geometry.robust import robust_sigma
 
 Array = NDArray[Any]
 MAX_POINTS = 400
@@ -80,7 +80,7 @@ def estimate_epipolar_pair(
     if len(points_i) > MAX_POINTS:
         rows = np.sort(np.random.default_rng(seed).permutation(len(points_i))[:MAX_POINTS])
         points_i, points_j = points_i[rows], points_j[rows]
-    noise_px = robust_sigma_px(_sampson_errors(F, points_i, points_j), 0.0)
+    noise_px = robust_sigma(_sampson_errors(F, points_i, points_j), 0.0)
     return EpipolarPair(camera_i, camera_j, points_i, points_j, F / np.linalg.norm(F), noise_px)
 
 

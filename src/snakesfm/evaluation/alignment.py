@@ -6,6 +6,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from snakesfm.geometry.robust import robust_sigma
+
 Array = NDArray[Any]
 ITERATIONS = 100
 TOLERANCE = 1e-12
@@ -63,11 +65,6 @@ def _median_scale_translation(points: Array, reference: Array) -> tuple[float, A
     usable = (baselines > 0) & (reference_baselines > 0)
     scale = float(np.median(reference_baselines[usable] / baselines[usable])) if usable.any() else 1.0
     return scale, np.median(reference - scale * points, axis=0)
-
-
-def robust_sigma(errors: Array, floor: float) -> float:
-    """Standard deviation of lengths of errors (n,) by their median, and no less than ``floor``."""
-    return max(1.4826 * float(np.median(errors)), floor)
 
 
 def align_poses(

@@ -44,6 +44,12 @@ class Camera:
             params=list(self.params),
         )
 
+    @classmethod
+    def of_pycolmap(cls, camera: "pycolmap.Camera", source: str = "given") -> "Camera":
+        """The camera that pycolmap holds."""
+        params = tuple(float(value) for value in camera.params)
+        return cls(camera.model_name, camera.width, camera.height, params, source)
+
     def normalize(self, keypoints: Array) -> Array:
         """Pixels (N,2) to undistorted points (N,2) on the plane z = 1 of the camera frame."""
         if len(keypoints) == 0:

@@ -8,6 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from snakesfm.geometry.camera import Camera
+from snakesfm.geometry.robust import robust_sigma
+from snakesfm.grouping import rows_of_each
 
 Array = NDArray[Any]
 
@@ -15,6 +17,7 @@ MAX_MISFIT = 0.2
 """Models that fit have 0.01 to 0.13."""
 ANNULI = 10
 MIN_OBSERVATIONS = 500
+# fewer never tell a lens from the tilt of their poses
 MIN_IMAGES = 5
 # of exact keypoints no error is left but that of the solver
 LEAST_NOISE_PX = 0.01
@@ -50,11 +53,8 @@ def fit_lenses(
     in_camera : (L,3) observed points in the frames of their images' cameras.
     keypoints : (L,2) pixels of the observations.
     """
-    order = np.argsort(camera_of, kind="stable")
-    numbers, starts = np.unique(camera_of[order], return_index=True)
     fits = {}
-    # of nothing there is one part, of no number
-    for number, rows in zip(numbers.tolist(), np.split(order, starts[1:]), strict=False):
+    for number, rows in rows_of_each(camera_of):
         if (
             number in cameras
             and len(rows) >= MIN_OBSERVATIONS
@@ -67,11 +67,14 @@ def fit_lenses(
 def _fit(camera: Camera, in_camera: Array, keypoints: Array) -> LensFit:
     model = camera.to_pycolmap()
     errors = keypoints - np.asarray(model.img_from_cam(in_camera))
+    # what the model cannot show
+    finite = np.isfinite(errors).all(axis=1)
+    errors, keypoints = errors[finite], keypoints[finite]
     offsets = keypoints - [model.params[k] for k in model.principal_point_idxs()]
     radii = np.linalg.norm(offsets, axis=1)
     outward = offsets / np.maximum(radii, 1e-9)[:, None]
     along = (errors * outward).sum(axis=1)
     across = errors[:, 1] * outward[:, 0] - errors[:, 0] * outward[:, 1]
-    noise_px = max(1.4826 * float(np.nanmedian(np.abs(across))), LEAST_NOISE_PX)
-    medians = [np.nanmedian(part) for part in np.array_split(along[np.argsort(radii)], ANNULI)]
+    noise_px = robust_sigma(across, LEAST_NOISE_PX)
+    medians = [np.median(part) for part in np.array_split(along[np.argsort(radii)], ANNULI)]
     return LensFit(float(np.sqrt(np.mean(np.square(medians)))) / noise_px, noise_px)

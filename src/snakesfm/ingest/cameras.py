@@ -191,4 +191,4 @@ def _initial_focal(stated: Array, cropped: Array, default: float) -> tuple[float
 
 def _create_camera(model: str, width: int, height: int, focal: float, source: str) -> Camera:
     camera = pycolmap.Camera.create_from_model_name(1, model, focal, width, height)
-    return Camera(model, width, height, tuple(camera.params.tolist()), source)
+    return Camera.of_pycolmap(camera, source)

@@ -32,23 +32,6 @@ def walk_images(folder: Path | str) -> Iterator[str]:
     return _walk(Path(folder), "", frozenset(), SUFFIXES)
 
 
-def list_unread(folder: Path | str) -> list[str]:
-    """Photographs of formats that are not read, but for those with an image of the same name beside them.
-
-    Returns
-    -------
-    POSIX paths relative to ``folder``, sorted.
-
-    Raises
-    ------
-    ConfigError : the folder, or one inside it, cannot be listed.
-    """
-    names = sorted(_walk(Path(folder), "", frozenset(), SUFFIXES + UNREAD_SUFFIXES))
-    unread = [name for name in names if name.lower().endswith(UNREAD_SUFFIXES)]
-    read = {PurePosixPath(name).with_suffix("") for name in set(names).difference(unread)}
-    return [name for name in unread if PurePosixPath(name).with_suffix("") not in read]
-
-
 def list_images(folder: Path | str) -> list[str]:
     """The image files of a folder at any depth.
 
@@ -64,6 +47,18 @@ def list_images(folder: Path | str) -> list[str]:
     ConfigError : the folder, or one inside it, cannot be listed.
     """
     return sorted(walk_images(folder))
+
+
+def list_photographs(folder: Path | str) -> tuple[list[str], list[str]]:
+    """What :func:`list_images` gives, and photographs of formats that are not read, in one walk.
+
+    Of the latter those are left out that have an image of the same name beside them.
+    """
+    names = sorted(_walk(Path(folder), "", frozenset(), SUFFIXES + UNREAD_SUFFIXES))
+    images = [name for name in names if name.lower().endswith(SUFFIXES)]
+    read = {PurePosixPath(name).with_suffix("") for name in images}
+    others = [name for name in names if name.lower().endswith(UNREAD_SUFFIXES)]
+    return images, [name for name in others if PurePosixPath(name).with_suffix("") not in read]
 
 
 def count_images(folder: Path | str, limit: int | None = None) -> int:

@@ -13,7 +13,7 @@ from snakesfm.artifacts.images import ImageIndex
 from snakesfm.errors import ImageError, SceneError
 from snakesfm.geometry.camera import cameras_to_columns
 from snakesfm.ingest.cameras import ImageCameras, Photograph, assign_cameras
-from snakesfm.ingest.discover import digest_images, fingerprint, list_images, list_unread
+from snakesfm.ingest.discover import digest_images, fingerprint, list_photographs
 from snakesfm.ingest.known import match_known_cameras, read_known_cameras
 from snakesfm.ingest.read import read_header
 from snakesfm.seeding import block_of
@@ -39,10 +39,10 @@ def run(job: StageJob) -> None:
     options: IndexImagesOptions = job.options
     folder = Path(job.settings["images"])
     known = read_known_cameras(job.settings["cameras"]) if job.settings.get("cameras") else None
-    names = list_images(folder)
+    names, unread = list_photographs(folder)
     digests = digest_images(folder, names, job.output.parent / DIGESTS_NAME, job.threads)
     photographs, refused = _read_headers(job, folder, names)
-    refused |= {name: UNREAD.format(path=folder / name) for name in list_unread(folder)}
+    refused |= {name: UNREAD.format(path=folder / name) for name in unread}
     _check_scene(folder, names, {digests[p.name] for p in photographs}, refused)
     sizes = [(p.width, p.height) for p in photographs]
     found = assign_cameras(

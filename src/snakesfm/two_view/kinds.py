@@ -7,13 +7,13 @@ import numpy as np
 import poselib
 from numpy.typing import NDArray
 
+from snakesfm.geometry.robust import robust_sigma
 from snakesfm.geometry.rotations import exp_so3
 from snakesfm.two_view.covariance import cauchy_variance, invert_information
 from snakesfm.two_view.sampson import (
     GENERATORS,
     Correspondences,
     cauchy_weights,
-    robust_sigma_px,
     solve_damped,
 )
 
@@ -77,7 +77,7 @@ def fit_rotation(
         inverse = 1.0 / np.maximum(turned[:, 2], 1e-6)
         image = turned[:, :2] * inverse[:, None]
         errors = points.focal_j * (image - points.rays_j[:, :2])
-        scale = loss_scale * robust_sigma_px(errors.ravel(), floor_px)
+        scale = loss_scale * robust_sigma(errors.ravel(), floor_px)
         d_turned = np.stack([turned @ g.T for g in GENERATORS], axis=1)
         # (M,3,2) flattened to one row per coordinate
         jacobian = (

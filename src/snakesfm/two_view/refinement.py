@@ -7,13 +7,13 @@ import numpy as np
 import poselib
 from numpy.typing import NDArray
 
+from snakesfm.geometry.robust import robust_sigma
 from snakesfm.two_view.bundle import refine_bundle
 from snakesfm.two_view.covariance import pose_covariance
 from snakesfm.two_view.estimators import poselib_camera
 from snakesfm.two_view.sampson import (
     Correspondences,
     refine_sampson,
-    robust_sigma_px,
     sampson_errors_px,
     sampson_jacobian,
 )
@@ -46,7 +46,7 @@ class RefinedPose:
 def noise_px(errors: Array, reach_px: float) -> float:
     """Robust standard deviation of the errors (M,) that lie within ``reach_px``."""
     near = np.abs(errors) < reach_px
-    return robust_sigma_px(errors[near], SIGMA_FLOOR_PX)
+    return robust_sigma(errors[near], SIGMA_FLOOR_PX)
 
 
 def refine_pose(

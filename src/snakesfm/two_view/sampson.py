@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 from snakesfm.two_view.tangents import cross_matrix, perturb_pose, tangent_basis
 
 Array = NDArray[Any]
-MAD_TO_SIGMA = 1.4826
 GENERATORS = np.stack([cross_matrix(axis) for axis in np.eye(3)])
 
 
@@ -87,13 +86,6 @@ def sampson_jacobian(points: Correspondences, rotation: Array, translation: Arra
     errors = algebraic / root
     jacobian = d_algebraic / root[:, None] - (errors / variance)[:, None] * half_d_variance
     return errors, jacobian
-
-
-def robust_sigma_px(errors: Array, floor_px: float) -> float:
-    """Standard deviation of errors (M,) by their median absolute value, not below ``floor_px``."""
-    if len(errors) == 0:
-        return floor_px
-    return max(MAD_TO_SIGMA * float(np.median(np.abs(errors))), floor_px)
 
 
 def cauchy_weights(errors: Array, scale: float) -> Array:

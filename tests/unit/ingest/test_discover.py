@@ -12,7 +12,7 @@ from snakesfm.ingest.discover import (
     digest_images,
     fingerprint_images,
     list_images,
-    list_unread,
+    list_photographs,
 )
 
 ODD_NAMES = ["a b.jpg", "#1.png", "{x}.JPEG", "dir/a b.jpg", "Ünï/写真.TIF", "z.WebP", "scan.bmp"]
@@ -37,8 +37,9 @@ def test_photographs_that_are_not_read_are_told_but_for_those_beside_an_image(tm
     touch_all(
         tmp_path, ["a/1.HEIC", "a/2.nef", "a/2.JPG", "b/2.nef", "c.d.cr3", "c.jpg", ".e.heic", "f.mov"]
     )
-    assert list_unread(tmp_path) == ["a/1.HEIC", "b/2.nef", "c.d.cr3"]
-    assert list_images(tmp_path) == ["a/2.JPG", "c.jpg"]
+    images, unread = list_photographs(tmp_path)
+    assert unread == ["a/1.HEIC", "b/2.nef", "c.d.cr3"]
+    assert images == list_images(tmp_path) == ["a/2.JPG", "c.jpg"]
 
 
 def test_counts_up_to_the_limit(tmp_path):
