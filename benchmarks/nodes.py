@@ -19,8 +19,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from benchmarks import ROOT, SOURCES
-from benchmarks.job_logs import DONE
 from benchmarks.marked_tables import replace_table
+from snakesfm.job_logs import DONE
 from snakesfm.synthetic.render_demo import make_demo
 from snakesfm.synthetic.scene import DemoOptions
 from tests.slurm_cluster import Cluster, missing_programs

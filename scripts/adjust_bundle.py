@@ -1,3 +1,3 @@
-from snakesfm.job import run_job
+from snakesfm.start import start_job
 
-run_job("adjust_bundle")
+start_job("adjust_bundle")

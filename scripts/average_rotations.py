@@ -1,3 +1,3 @@
-from snakesfm.job import run_job
+from snakesfm.start import start_job
 
-run_job("average_rotations")
+start_job("average_rotations")

@@ -1,3 +1,3 @@
-from snakesfm.job import run_job
+from snakesfm.start import start_job
 
-run_job("select_pairs")
+start_job("select_pairs")

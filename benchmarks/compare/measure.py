@@ -83,7 +83,7 @@ def run_measured(command: list[str], folder: Path, log: Path, limit_s: float) ->
         )
         try:
             while True:
-                peak = max(peak, _resident_mib(process.pid))
+                peak = max(peak, _memory_mib(process.pid))
                 done, status, usage = os.wait4(process.pid, os.WNOHANG)
                 if done:
                     break
@@ -132,8 +132,8 @@ def run_operation(operation: str, arguments: dict[str, Any], log: Path, limit_s:
         return run_measured(command, log.parent, log, limit_s)
 
 
-def _resident_mib(pid: int) -> float:
-    """Resident memory of a process and all below it, or the largest high-water mark of one, in MiB.
+def _memory_mib(pid: int) -> float:
+    """Memory of a process and all below it, or the largest high-water mark of one, in MiB.
 
     The system's own record (ru_maxrss) will not do: it holds what the process that started them used.
     """
@@ -142,7 +142,8 @@ def _resident_mib(pid: int) -> float:
         top = psutil.Process(pid)
         for process in (top, *top.children(recursive=True)):
             with contextlib.suppress(psutil.Error, OSError):
-                total += process.memory_info().rss
+                # pages that several processes share count once
+                total += process.memory_full_info().pss
                 status = Path(f"/proc/{process.pid}/status").read_text("utf-8")
                 marks = [line.split()[1] for line in status.splitlines() if line.startswith("VmHWM:")]
                 highest = max([highest, *(1024 * int(mark) for mark in marks)])

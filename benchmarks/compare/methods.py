@@ -12,7 +12,7 @@ from pathlib import Path
 from benchmarks import ROOT
 from benchmarks.compare.measure import Cost, run_measured, run_operation
 from benchmarks.compare.sets import ImageSet
-from benchmarks.job_logs import DONE
+from snakesfm.job_logs import DONE
 
 FEATURES = 5000
 EXTRACT = (

@@ -12,9 +12,9 @@ from pathlib import Path
 import h5py
 import yaml
 
-from benchmarks import ROOT, SOURCES
-from benchmarks.job_logs import DONE
+from benchmarks import NO_FORKS, ROOT, SOURCES
 from snakesfm.blocks import choose_blocks
+from snakesfm.job_logs import DONE
 from snakesfm.simulate import Simulation, SimulationOptions
 
 TILED = ("match_pairs", "estimate_two_view")
@@ -93,7 +93,11 @@ def measure(
         scene = folder.resolve() / "results" / folder.name
         command += [str(scene / "estimate_two_view" / f"{name}.h5") for name in names]
     subprocess.run(
-        command, cwd=folder, env={**os.environ, **SOURCES}, check=True, stdout=subprocess.DEVNULL
+        command,
+        cwd=folder,
+        env={**os.environ, **SOURCES, **NO_FORKS},
+        check=True,
+        stdout=subprocess.DEVNULL,
     )
     result = collect(options, folder)
     result.config = list(config)

@@ -12,6 +12,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from snakesfm.job_logs import clock, describe_cost
+
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
@@ -52,8 +54,7 @@ def run_job(stage: str) -> None:
     ----------
     stage : verb_noun name of the stage.
     """
-    for variable in THREAD_VARIABLES:
-        os.environ[variable] = "1"
+    limit_library_threads()
     call = Call.parse(stage, sys.stdin.buffer.read().decode("utf-8"))
     terminal = _redirect_to_log(call.log)
     try:
@@ -61,18 +62,21 @@ def run_job(stage: str) -> None:
         _check_inputs(job)
         module = importlib.import_module(f"snakesfm.stages.{stage}")
         started, before = time.time(), _processor_seconds()
-        print(f"{_clock(started)} {stage} {job.output}", flush=True)
+        print(f"{clock(started)} {stage} {job.output}", flush=True)
         module.run(job)
         _keep_former(job, module)
         _share(job, module)
     except Exception as error:
         _fail(call, error, terminal)
     ended = time.time()
-    print(
-        f"{_clock(ended)} {stage} done in {ended - started:.2f} s, "
-        f"{_processor_seconds() - before:.2f} s of processor time, {peak_mb():.0f} MB at most",
-        flush=True,
-    )
+    cpu_seconds = _processor_seconds() - before
+    print(describe_cost(stage, ended, ended - started, cpu_seconds, peak_mb()), flush=True)
+
+
+def limit_library_threads() -> None:
+    """Give libraries that are loaded after this one thread each: stages start the threads themselves."""
+    for variable in THREAD_VARIABLES:
+        os.environ[variable] = "1"
 
 
 def _processor_seconds() -> float:
@@ -82,18 +86,13 @@ def _processor_seconds() -> float:
 
 
 def peak_mb() -> float:
-    """Largest memory of this process so far, exact where Snakemake's record of a job is sampled."""
+    """Largest memory of this process so far; a fork starts with what it was forked from."""
     with contextlib.suppress(OSError), Path("/proc/self/status").open(encoding="utf-8") as status:
         for line in status:
             if line.startswith("VmHWM:"):
                 return int(line.split()[1]) / 1024
     # where there is no /proc; it holds what Snakemake had when it started the job, too
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-
-
-def _clock(seconds: float) -> str:
-    """Local date and time to the millisecond."""
-    return time.strftime("%Y-%m-%dT%H:%M:%S", time.localtime(seconds)) + f".{int(seconds % 1 * 1000):03d}"
 
 
 def _redirect_to_log(path: Path) -> Any:

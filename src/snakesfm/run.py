@@ -230,7 +230,7 @@ class Run:
 
 
 def _cancel_timers() -> None:
-    """End Snakemake's benchmark timers, which outlive their jobs and hold the process for a second."""
+    """End the timers of Snakemake's scheduler, which hold the process for a second after the last job."""
     for thread in threading.enumerate():
         if isinstance(thread, threading.Timer):
             thread.cancel()

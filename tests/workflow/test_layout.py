@@ -51,14 +51,14 @@ def test_rule_writes_to_the_folder_of_its_name_and_runs_its_script(root: Path, s
     output = re.search(r"output:\n(.*?)log:", text, re.S)[1]
     assert set(re.findall(r'artifact\(\s*"(\w+)"', output)) == {stage}
     assert text.count("files=job_files(),") == 1
-    for directive in ("log_file", "benchmark_file", "job_params", "job_command"):
+    for directive in ("log_file", "job_params", "job_command"):
         assert re.findall(rf'{directive}\("(\w+)"', text) == [stage]
 
 
 @pytest.mark.parametrize("stage", STAGES)
 def test_script_is_thin_and_stage_has_run(root: Path, stage: str) -> None:
     script = (root / "scripts" / f"{stage}.py").read_text()
-    assert f'run_job("{stage}")' in script
+    assert f'start_job("{stage}")' in script
     assert len(script.splitlines()) <= 10
     tree = ast.parse((root / "src/snakesfm/stages" / f"{stage}.py").read_text())
     assert "run" in {node.name for node in tree.body if isinstance(node, ast.FunctionDef)}

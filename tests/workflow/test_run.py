@@ -1,22 +1,27 @@
 """Whole runs on a small rendered scene: results, resuming, re-running, killing."""
 
+import contextlib
 import json
+import os
 import re
 import shutil
 import signal
+import time
 from pathlib import Path
 
 import cv2
 import h5py
 import numpy as np
+import psutil
 import pycolmap
 import pytest
-from workflow_runner import copy_run, model_bytes
+from workflow_runner import Workflow, copy_run, model_bytes
 
 from benchmarks.compare.measure import Cost
 from benchmarks.compare.methods import stage_costs
 from snakesfm.artifacts import LocalFeatures, Reconstruction
 from snakesfm.config.configuration import STAGES
+from snakesfm.start import NO_SERVER, VARIABLE
 
 MAPPING = [
     "build_view_graph",
@@ -290,3 +295,28 @@ def test_logs_say_what_the_jobs_cost(finished) -> None:
         assert 0.0 < costs[name].seconds < 600.0
         assert 0.0 < costs[name].cpu_seconds < 600.0
         assert 20.0 < costs[name].peak_mib < 4000.0
+
+
+def test_jobs_are_forked_and_make_the_same_model_as_jobs_of_their_own(
+    finished, small_scene: Path, workflow
+) -> None:
+    forks = set()
+    environment = {**os.environ, "TMPDIR": str(workflow.folder)}
+    with Workflow(workflow.folder, environment=environment).start(
+        *config_of(small_scene), "--quiet", "all"
+    ) as run:
+        while run.poll() is None:
+            with contextlib.suppress(psutil.Error):
+                for server in psutil.Process(run.pid).children():
+                    if "snakesfm.job_server" in server.cmdline():
+                        forks.update(fork.pid for fork in server.children())
+            time.sleep(0.01)
+        assert run.returncode == 0, run.stdout.read()
+    assert len(forks) >= len(MAPPING) // 2
+    assert list(workflow.folder.glob("snakesfm-*")) == []
+    alone = Workflow(workflow.folder, environment={**os.environ, VARIABLE: NO_SERVER}).run(
+        *config_of(small_scene), "--forceall"
+    )
+    assert alone.status == 0, alone.text
+    assert len(alone.rules) > len(MAPPING)
+    assert model_bytes(workflow.folder / "out" / "square") == model_bytes(finished[0])

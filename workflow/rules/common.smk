@@ -10,6 +10,7 @@ from snakemake.settings.types import DeploymentMethod, Quietness
 
 from snakesfm import resources, slurm
 from snakesfm.errors import SnakesfmError
+from snakesfm.job_server import JobServer
 from snakesfm.blocks import tile_names
 from snakesfm.plan import Plan
 from snakesfm.records import makes_nothing
@@ -33,13 +34,18 @@ try:
 except SnakesfmError as error:
     raise refusal(error) from None
 
+JOB_SERVER = JobServer()
 IN_CONTAINER = (
     DeploymentMethod.APPTAINER in workflow.deployment_settings.deployment_method
 )
 # a stage with more outputs names them itself, because Snakemake keeps the command with each of them
 MOST_LISTED_OUTPUTS = 16
 # freed images stay with the process, in huge pages: glibc would give them back, and each page is cleared anew
-MALLOC = "MALLOC_MMAP_THRESHOLD_=33554432 MALLOC_TRIM_THRESHOLD_=1073741824 GLIBC_TUNABLES=glibc.malloc.hugetlb=1"
+MALLOC = {
+    "MALLOC_MMAP_THRESHOLD_": "33554432",
+    "MALLOC_TRIM_THRESHOLD_": "1073741824",
+    "GLIBC_TUNABLES": "glibc.malloc.hugetlb=1",
+}
 
 
 wildcard_constraints:
@@ -59,11 +65,6 @@ def artifact(stage, file):
 def log_file(stage, part="job"):
     """The pattern of a job's log."""
     return f"{OUTPUT}/{{scene}}/logs/{stage}/{part}.log"
-
-
-def benchmark_file(stage, part="job"):
-    """The pattern of a job's time and memory record."""
-    return f"{OUTPUT}/{{scene}}/benchmarks/{stage}/{part}.tsv"
 
 
 def files_of(stage, parts):
@@ -207,7 +208,8 @@ def job_command(stage):
     """
     python = "python" if IN_CONTAINER else shlex.quote(sys.executable)
     script = shlex.quote(f"{workflow.basedir}/scripts/{stage}.py")
-    command = f"{MALLOC} exec {python} {script}".replace("{", "{{").replace("}", "}}")
+    malloc = " ".join(f"{name}={value}" for name, value in MALLOC.items())
+    command = f"{malloc} exec {python} {script}".replace("{", "{{").replace("}", "}}")
     return f"{command} <<'END OF JOB'\n{{params.job}}\n{{params.files}}\n{{threads}}\n{{log}}\nEND OF JOB\n"
 
 
@@ -255,6 +257,8 @@ def start_run():
     slurm_run = getattr(executor, "run_uuid", "")
     if slurm_run:
         slurm.steady(executor)
+    if workflow.local_exec and not workflow.deployment_settings.deployment_method:
+        JOB_SERVER.start(MALLOC)
     try:
         RUN.start(slurm_run)
     except SnakesfmError as error:
@@ -263,9 +267,11 @@ def start_run():
 
 def finish_run(log):
     """One line per scene about its model."""
+    JOB_SERVER.stop()
     RUN.finish()
 
 
 def fail_run(log):
     """One line per scene that ended well, and one per error."""
+    JOB_SERVER.stop()
     RUN.fail()

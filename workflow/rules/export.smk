@@ -12,8 +12,6 @@ rule export_database:
         artifact("export_database", "database.db"),
     log:
         log_file("export_database"),
-    benchmark:
-        benchmark_file("export_database")
     resources:
         mem_mb=memory_mb("export_database"),
         runtime=runtime_min("export_database"),
@@ -45,8 +43,6 @@ rule export_hloc:
         artifact("export_hloc", "pairs.txt"),
     log:
         log_file("export_hloc"),
-    benchmark:
-        benchmark_file("export_hloc")
     resources:
         mem_mb=memory_mb("export_hloc"),
         runtime=runtime_min("export_hloc"),
@@ -73,8 +69,6 @@ rule export_model:
         artifact("export_model", "summary.json"),
     log:
         log_file("export_model"),
-    benchmark:
-        benchmark_file("export_model")
     resources:
         mem_mb=memory_mb("export_model"),
         runtime=runtime_min("export_model"),
@@ -94,8 +88,6 @@ rule evaluate_model:
         artifact("evaluate_model", "metrics.csv"),
     log:
         log_file("evaluate_model"),
-    benchmark:
-        benchmark_file("evaluate_model")
     resources:
         mem_mb=memory_mb("evaluate_model"),
         runtime=runtime_min("evaluate_model"),

@@ -8,8 +8,6 @@ rule extract_features:
         artifact("extract_features", "{block}.h5"),
     log:
         log_file("extract_features", "{block}"),
-    benchmark:
-        benchmark_file("extract_features", "{block}")
     resources:
         gpu=gpus("extract_features"),
         mem_mb=memory_mb("extract_features"),
@@ -28,8 +26,6 @@ rule learn_vocabulary:
         artifact("learn_vocabulary", "vocabulary.h5"),
     log:
         log_file("learn_vocabulary"),
-    benchmark:
-        benchmark_file("learn_vocabulary")
     resources:
         mem_mb=memory_mb("learn_vocabulary"),
         runtime=runtime_min("learn_vocabulary"),
@@ -49,8 +45,6 @@ rule describe_images:
         artifact("describe_images", "{block}.h5"),
     log:
         log_file("describe_images", "{block}"),
-    benchmark:
-        benchmark_file("describe_images", "{block}")
     resources:
         gpu=gpus("describe_images"),
         mem_mb=memory_mb("describe_images"),
@@ -76,8 +70,6 @@ for blocks, scenes in PLAN.scenes_by_blocks().items():
             [artifact("select_pairs", f"{tile}.h5") for tile in tile_names(blocks)],
         log:
             log_file("select_pairs"),
-        benchmark:
-            benchmark_file("select_pairs")
         wildcard_constraints:
             scene=any_of(scenes),
         # blocks of the similarity matrix are computed side by side, and pairs looked at

@@ -6,8 +6,6 @@ rule index_images:
         artifact("index_images", "index.h5"),
     log:
         log_file("index_images"),
-    benchmark:
-        benchmark_file("index_images")
     threads: 2
     resources:
         mem_mb=memory_mb("index_images"),

@@ -9,8 +9,6 @@ rule build_view_graph:
         artifact("build_view_graph", "graph.h5"),
     log:
         log_file("build_view_graph"),
-    benchmark:
-        benchmark_file("build_view_graph")
     resources:
         mem_mb=memory_mb("build_view_graph"),
         runtime=runtime_min("build_view_graph"),
@@ -29,8 +27,6 @@ rule filter_view_graph:
         artifact("filter_view_graph", "graph.h5"),
     log:
         log_file("filter_view_graph"),
-    benchmark:
-        benchmark_file("filter_view_graph")
     resources:
         mem_mb=memory_mb("filter_view_graph"),
         runtime=runtime_min("filter_view_graph"),
@@ -49,8 +45,6 @@ rule average_rotations:
         artifact("average_rotations", "rotations.h5"),
     log:
         log_file("average_rotations"),
-    benchmark:
-        benchmark_file("average_rotations")
     resources:
         mem_mb=memory_mb("average_rotations"),
         runtime=runtime_min("average_rotations"),
@@ -73,8 +67,6 @@ rule build_tracks:
         artifact("build_tracks", "tracks.h5"),
     log:
         log_file("build_tracks"),
-    benchmark:
-        benchmark_file("build_tracks")
     resources:
         mem_mb=memory_mb("build_tracks"),
         runtime=runtime_min("build_tracks"),
@@ -96,8 +88,6 @@ rule average_translations:
         artifact("average_translations", "centers.h5"),
     log:
         log_file("average_translations"),
-    benchmark:
-        benchmark_file("average_translations")
     resources:
         mem_mb=memory_mb("average_translations"),
         runtime=runtime_min("average_translations"),
@@ -119,8 +109,6 @@ rule triangulate_tracks:
         artifact("triangulate_tracks", "points.h5"),
     log:
         log_file("triangulate_tracks"),
-    benchmark:
-        benchmark_file("triangulate_tracks")
     resources:
         mem_mb=memory_mb("triangulate_tracks"),
         runtime=runtime_min("triangulate_tracks"),
@@ -145,8 +133,6 @@ rule adjust_bundle:
         artifact("adjust_bundle", "reconstruction.h5"),
     log:
         log_file("adjust_bundle"),
-    benchmark:
-        benchmark_file("adjust_bundle")
     # keypoints are refined side by side
     threads: 2
     resources:

@@ -10,8 +10,6 @@ rule match_pairs:
         artifact("match_pairs", "{tile}.h5"),
     log:
         log_file("match_pairs", "{tile}"),
-    benchmark:
-        benchmark_file("match_pairs", "{tile}")
     resources:
         gpu=gpus("match_pairs"),
         mem_mb=memory_mb("match_pairs"),
@@ -31,8 +29,6 @@ rule merge_keypoints:
         artifact("merge_keypoints", "{block}.h5"),
     log:
         log_file("merge_keypoints", "{block}"),
-    benchmark:
-        benchmark_file("merge_keypoints", "{block}")
     resources:
         mem_mb=memory_mb("merge_keypoints"),
         runtime=runtime_min("merge_keypoints"),
@@ -51,8 +47,6 @@ rule index_matches:
         artifact("index_matches", "{tile}.h5"),
     log:
         log_file("index_matches", "{tile}"),
-    benchmark:
-        benchmark_file("index_matches", "{tile}")
     resources:
         mem_mb=memory_mb("index_matches"),
         runtime=runtime_min("index_matches"),
@@ -72,8 +66,6 @@ rule calibrate_cameras:
         artifact("calibrate_cameras", "cameras.h5"),
     log:
         log_file("calibrate_cameras"),
-    benchmark:
-        benchmark_file("calibrate_cameras")
     # pairs are worked on side by side
     threads: 2
     resources:
@@ -96,8 +88,6 @@ rule estimate_two_view:
         artifact("estimate_two_view", "{tile}.h5"),
     log:
         log_file("estimate_two_view", "{tile}"),
-    benchmark:
-        benchmark_file("estimate_two_view", "{tile}")
     resources:
         mem_mb=memory_mb("estimate_two_view"),
         runtime=runtime_min("estimate_two_view"),

@@ -16,8 +16,6 @@ rule render_report:
         artifact("render_report", "index.html"),
     log:
         log_file("render_report"),
-    benchmark:
-        benchmark_file("render_report")
     resources:
         mem_mb=memory_mb("render_report"),
         runtime=runtime_min("render_report"),

@@ -1,9 +1,7 @@
 """Rows of the report's tables, as text, numbers and None."""
 
-import csv
 import re
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -110,26 +108,3 @@ def image_rows(
             row += [scores.get("rotation_error_deg"), scores.get("position_error")]
         rows.append(row)
     return rows, note
-
-
-def stage_times(benchmarks: Mapping[Path, str]) -> dict[str, tuple[float, float]]:
-    """Seconds (sum over jobs) and peak memory in MB (largest job) of each stage.
-
-    Parameters
-    ----------
-    benchmarks : Snakemake's benchmark tables by path; the folder's name is the stage.
-    """
-    totals: dict[str, tuple[float, float]] = {}
-    for path, text in benchmarks.items():
-        for row in csv.DictReader(text.splitlines(), delimiter="\t"):
-            seconds, peak = totals.get(path.parent.name, (0.0, 0.0))
-            used = _number(row.get("max_rss"))
-            totals[path.parent.name] = seconds + _number(row.get("s")), max(peak, used)
-    return totals
-
-
-def _number(text: str | None) -> float:
-    try:
-        return float(text or "nan") if text not in (None, "-", "NA") else 0.0
-    except ValueError:
-        return 0.0

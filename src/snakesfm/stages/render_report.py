@@ -24,6 +24,7 @@ from snakesfm.artifacts import (
 from snakesfm.artifacts.base import Array
 from snakesfm.artifacts.pairs import EDGE_LABELS, KINDS, REJECTIONS
 from snakesfm.geometry.camera import cameras_from_columns
+from snakesfm.job_logs import stage_costs
 from snakesfm.reporting.page import Page, render_page
 from snakesfm.reporting.plots import error_histogram, scene_map, view_axes
 from snakesfm.reporting.registration import (
@@ -33,7 +34,7 @@ from snakesfm.reporting.registration import (
     observation_errors,
     reason_not_registered,
 )
-from snakesfm.reporting.tables import bundle_rows, image_rows, label_counts, metric_tables, stage_times
+from snakesfm.reporting.tables import bundle_rows, image_rows, label_counts, metric_tables
 from snakesfm.stages.job import StageJob
 from snakesfm.tracks.merged import describe_lengths
 
@@ -63,8 +64,8 @@ def run(job: StageJob) -> None:
     points = _read_columns(TriangulatedPoints, job.path("points"), ("offsets", "image_ids"))
     metrics = json.loads(job.path("metrics").read_text("utf-8"))
     summary = json.loads(job.path("summary").read_text("utf-8")) if "summary" in job.inputs else {}
-    # no declared inputs: a lost record of a job's time is no reason to run the job again
-    benchmarks = sorted((job.output.parents[1] / "benchmarks").rglob("*.tsv"))
+    # no declared inputs: a lost log is no reason to run the job again
+    logs = (job.output.parents[1] / "logs").rglob("*.log")
 
     count = len(index.names)
     names = [str(name) for name in index.names]
@@ -91,7 +92,7 @@ def run(job: StageJob) -> None:
         observations=count_by_image(model.image_ids, count),
         mean_error_px=mean_by_image(errors, model.image_ids, count),
     )
-    seconds = stage_times({path: path.read_text("utf-8") for path in benchmarks})
+    seconds = stage_costs(path.read_text("utf-8", errors="replace") for path in logs)
     rows, note = image_rows(names, counts, metrics.get("per_image", {}), job.options.max_images)
     heads = ["image", "registered", "pairs", "accepted", "kept edges", "observations", "mean error px"]
     if metrics.get("per_image"):

@@ -29,6 +29,7 @@ from snakesfm.config.export_model import ExportModelOptions
 from snakesfm.config.render_report import RenderReportOptions
 from snakesfm.evaluation.colmap_model import read_model
 from snakesfm.geometry.camera import Camera, cameras_to_columns
+from snakesfm.job_logs import describe_cost
 from snakesfm.stages import evaluate_model, export_model, render_report
 from snakesfm.stages.job import StageJob
 from snakesfm.synthetic.problems import SyntheticProblem, make_problem
@@ -485,9 +486,9 @@ def write_former_stages(folder: Path, problem: SyntheticProblem) -> dict[str, ob
         keypoints=keypoints,
         colors=np.zeros((len(problem.points), 3), np.uint8),
     ).write(folder / "points.h5", HEADER)
-    times = folder / "benchmarks" / "match_pairs" / "0-0.tsv"
-    times.parent.mkdir(parents=True)
-    times.write_text("s\th:m:s\tmax_rss\n12.5\t0:00:12\t321.0\n", "utf-8")
+    log = folder / "logs" / "match_pairs" / "0-0.log"
+    log.parent.mkdir(parents=True)
+    log.write_text(describe_cost("match_pairs", 0.0, 12.5, 12.0, 321.0) + "\n", "utf-8")
     names = ("graph", "rotations", "tracks", "points", "index", "reconstruction")
     inputs: dict[str, object] = {name: str(folder / f"{name}.h5") for name in names}
     return {**inputs, "geometries": [str(folder / "geometries.h5")]}

@@ -2,7 +2,6 @@
 
 import base64
 import re
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -18,7 +17,7 @@ from snakesfm.reporting.registration import (
     observation_errors,
     reason_not_registered,
 )
-from snakesfm.reporting.tables import image_rows, label_counts, metric_tables, stage_times
+from snakesfm.reporting.tables import image_rows, label_counts, metric_tables
 from snakesfm.synthetic.layouts import look_at
 from snakesfm.synthetic.problems import make_problem
 
@@ -134,16 +133,6 @@ def test_metrics_are_grouped_by_threshold_and_statistic_without_texts() -> None:
     assert areas[2] == [["pose AUC", 80.0, None, 90.0], ["relative pose AUC", None, 70.0, None]]
     assert errors[2] == [["position error", 0.25, None, 0.5, None]]
     assert others[2] == [["points", 3]]
-
-
-def test_stage_times_sum_the_jobs_of_a_stage_and_bear_missing_values() -> None:
-    head = "s\th:m:s\tmax_rss\n"
-    tables = {
-        Path("b/match_pairs/0-0.tsv"): head + "2.5\t0:00:02\t100\n",
-        Path("b/match_pairs/0-1.tsv"): head + "1.5\t0:00:01\t300\n",
-        Path("b/index_images/job.tsv"): head + "0.5\t0:00:00\tNA\n",
-    }
-    assert stage_times(tables) == {"match_pairs": (4.0, 300.0), "index_images": (0.5, 0.0)}
 
 
 def test_histogram_has_all_errors_and_bears_none() -> None:

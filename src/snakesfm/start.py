@@ -1,0 +1,54 @@
+"""What a job's script calls: a fork of the run's job server, or the job in this process.
+
+Imports no more than it needs to ask the server, as this is what each job waits for.
+"""
+
+import os
+import socket
+import sys
+
+VARIABLE = "SNAKESFM_JOB_SERVER"
+NO_SERVER = "off"
+
+
+def start_job(stage: str) -> None:
+    """Run one stage as the Snakemake job that standard input describes.
+
+    Parameters
+    ----------
+    stage : verb_noun name of the stage.
+    """
+    status = fork_job(stage)
+    if status is not None:
+        sys.exit(status)
+    from snakesfm.job import run_job
+
+    run_job(stage)
+
+
+def fork_job(stage: str) -> int | None:
+    """Have the server fork a job with this process's standard streams and environment, and wait for it.
+
+    Parameters
+    ----------
+    stage : verb_noun name of the stage.
+
+    Returns
+    -------
+    The job's exit status; None where there is no server, so that nothing was done.
+    """
+    address = os.environ.get(VARIABLE, NO_SERVER)
+    if address == NO_SERVER:
+        return None
+    request = b"\0".join([stage.encode(), *(b"%s=%s" % item for item in os.environb.items())])
+    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as server:
+        try:
+            server.connect(address)
+            socket.send_fds(server, [request], [0, 1, 2])
+        except OSError:
+            return None
+        try:
+            # a job that is killed says nothing
+            return int(server.recv(16) or b"1")
+        except OSError:
+            return 1

@@ -1,0 +1,205 @@
+"""Jobs that are forked from a server behave as jobs of their own."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from snakesfm.job_server import JobServer
+from snakesfm.start import NO_SERVER, VARIABLE
+
+Command = subprocess.Popen[str]
+CLIENT = "import sys; from snakesfm.start import fork_job; sys.exit(fork_job(sys.argv[1]) or 0)"
+PARENT = """
+import os, sys
+from snakesfm.job_server import JobServer
+server = JobServer()
+server.start({})
+print(os.environ["SNAKESFM_JOB_SERVER"], flush=True)
+sys.stdin.read()
+"""
+
+
+def wait_until(condition: Callable[[], object], seconds: float = 20) -> None:
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, "waited in vain"
+        time.sleep(0.02)
+
+
+@pytest.fixture
+def parent(tmp_path: Path) -> Iterator[Command]:
+    """A process that has started a server; its ``address`` is ready."""
+    environment = {**os.environ, "TMPDIR": str(tmp_path)}
+    environment.pop(VARIABLE, None)
+    process = subprocess.Popen(
+        [sys.executable, "-c", PARENT],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+        env=environment,
+    )
+    yield process
+    process.kill()
+    process.communicate()
+
+
+@pytest.fixture
+def address(parent: Command) -> str:
+    """The socket of a server that has loaded its libraries."""
+    path = parent.stdout.readline().strip()
+    wait_until(lambda: Path(path).exists())
+    return path
+
+
+def children(pid: int) -> list[int]:
+    return [int(child) for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
+
+
+def server_of(parent: Command) -> int:
+    (server,) = children(parent.pid)
+    return server
+
+
+@pytest.fixture
+def ask(address: str) -> Iterator[Callable[[str], Command]]:
+    """Starts a job's command that has the server run a stage."""
+    commands = []
+
+    def start(stage: str) -> Command:
+        commands.append(
+            subprocess.Popen(
+                [sys.executable, "-c", CLIENT, stage],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.PIPE,
+                text=True,
+                env={**os.environ, VARIABLE: address},
+            )
+        )
+        return commands[-1]
+
+    yield start
+    for command in commands:
+        command.kill()
+        command.communicate()
+
+
+def waiting_job(parent: Command, ask: Callable[[str], Command]) -> tuple[Command, int]:
+    """A job that waits for its standard input, and its process."""
+    command = ask("index_images")
+    server = server_of(parent)
+    stream = Path(f"/proc/{command.pid}/fd/0").readlink()
+
+    def waits() -> bool:
+        running = [job for job in children(server) if not has_ended(job)]
+        return bool(running) and Path(f"/proc/{running[0]}/fd/0").readlink() == stream
+
+    wait_until(waits)
+    return command, next(job for job in children(server) if not has_ended(job))
+
+
+def has_ended(pid: int) -> bool:
+    """Also of one that the server has not asked after yet."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
+    except FileNotFoundError:
+        return True
+
+
+def call_text(folder: Path, images: Path) -> str:
+    """What the rule of index_images tells its job."""
+    params = {
+        "options": {"camera_model": "auto"},
+        "stage_version": 1,
+        "settings": {"images": str(images)},
+        "seed": 0,
+    }
+    files = {
+        "scene": "s",
+        "inputs": {},
+        "outputs": [str(folder / "index_images" / "index.h5")],
+        "upstream": {},
+        "batch_size": "auto",
+    }
+    return "\n".join([json.dumps(params), json.dumps(files), "1", str(folder / "job.log")]) + "\n"
+
+
+def test_a_job_has_the_streams_and_the_status_of_its_command(ask, tmp_path: Path) -> None:
+    client = ask("no_such_stage")
+    out, err = client.communicate(call_text(tmp_path / "out", tmp_path), timeout=30)
+    assert (client.returncode, out) == (1, "")
+    assert err.startswith("snakesfm: scene 's', no_such_stage: Unexpected ModuleNotFoundError")
+    log = (tmp_path / "out" / "job.log").read_text("utf-8")
+    assert log.endswith(f"error: {err.removeprefix('snakesfm: scene ').split(': ', 1)[1]}")
+
+
+def test_a_killed_job_fails_its_command(parent: Command, ask) -> None:
+    client, job = waiting_job(parent, ask)
+    os.kill(job, signal.SIGKILL)
+    client.communicate(timeout=10)
+    assert client.returncode == 1
+
+
+def test_a_job_ends_with_its_command(parent: Command, ask) -> None:
+    client, job = waiting_job(parent, ask)
+    client.kill()
+    wait_until(lambda: has_ended(job))
+    # and the server goes on
+    again, other = waiting_job(parent, ask)
+    os.kill(other, signal.SIGTERM)
+    again.communicate(timeout=10)
+    assert again.returncode == 1
+
+
+def test_an_interrupt_ends_jobs_and_not_the_server(parent: Command, ask) -> None:
+    client, job = waiting_job(parent, ask)
+    server = server_of(parent)
+    for pid in (server, job):
+        os.kill(pid, signal.SIGINT)
+    client.communicate(timeout=10)
+    assert client.returncode == 130
+    assert not has_ended(server)
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
+def test_the_server_ends_with_who_started_it(
+    parent: Command, address: str, number: int, tmp_path: Path
+) -> None:
+    server = server_of(parent)
+    parent.send_signal(number)
+    parent.wait(timeout=10)
+    wait_until(lambda: not Path(address).parent.exists())
+    wait_until(lambda: has_ended(server))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_without_a_server_nothing_is_asked(parent: Command, address: str, tmp_path: Path) -> None:
+    os.kill(server_of(parent), signal.SIGKILL)
+    script = Path(__file__).resolve().parents[2] / "scripts" / "index_images.py"
+    for value in (address, str(tmp_path / "nothing"), NO_SERVER):
+        done = subprocess.run(
+            [sys.executable, str(script)],
+            input=call_text(tmp_path / "out", tmp_path / "missing"),
+            capture_output=True,
+            text=True,
+            env={**os.environ, VARIABLE: value},
+            timeout=60,
+            check=False,
+        )
+        assert done.returncode == 1
+        assert done.stderr.startswith("snakesfm: scene 's', index_images: ")
+
+
+def test_no_server_beside_another_one(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv(VARIABLE, NO_SERVER)
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    JobServer().start({})
+    assert os.environ[VARIABLE] == NO_SERVER
+    assert list(tmp_path.iterdir()) == []
