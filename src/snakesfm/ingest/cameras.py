@@ -1,6 +1,6 @@
 """Which images were taken by one camera, and what its intrinsics are before anything is measured."""
 
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
 from pathlib import PurePosixPath
@@ -20,6 +20,8 @@ Sharing = Literal["auto", "exif", "single", "per_folder", "per_image"]
 MODELS_OF_ONE_SIZE = 5
 # images without EXIF are of one camera where at most one size comes with so many images
 IMAGES_PER_SIZE = 20
+# or those of one size where it is that of so many of them, beside a few strays
+SHARE_OF_ONE_SIZE = 0.75
 # 'auto' begins with it; adjust_bundle takes a wider model where a lens needs one
 FIRST_MODEL = "SIMPLE_RADIAL"
 
@@ -37,6 +39,11 @@ class Photograph:
     def folder(self) -> str:
         """The folder of the relative name."""
         return str(PurePosixPath(self.name).parent)
+
+    @property
+    def sides(self) -> tuple[int, int]:
+        """The shorter and the longer side in pixels."""
+        return min(self.width, self.height), max(self.width, self.height)
 
     @property
     def body(self) -> tuple[str, str] | None:
@@ -130,7 +137,8 @@ def group_images(photographs: Sequence[Photograph], sharing: Sharing) -> list[Ha
     photographs : the images.
     sharing : ``single``, ``per_folder`` and ``per_image`` as they say. ``exif``: by camera, lens and focal
         length; images without EXIF each have their own. ``auto``: as ``exif``, but cropped images have
-        their own, and images without EXIF share per folder where their sizes agree as one camera's do.
+        their own, and images without EXIF share per folder where their sizes agree as one camera's do, a
+        few strays apart.
     """
     if sharing == "single":
         return [(p.width, p.height) for p in photographs]
@@ -140,12 +148,12 @@ def group_images(photographs: Sequence[Photograph], sharing: Sharing) -> list[Ha
         return [p.name for p in photographs]
     if sharing == "exif":
         return [_exif_key(p) if p.body else p.name for p in photographs]
-    uniform = _uniform_folders(photographs)
+    shared = _shared_sizes(photographs)
     keys: list[Hashable] = []
     for photograph, cropped in zip(photographs, find_cropped(photographs), strict=True):
         if photograph.body:
             keys.append(photograph.name if cropped else _exif_key(photograph))
-        elif photograph.folder in uniform:
+        elif (photograph.folder, photograph.sides) in shared:
             keys.append((photograph.folder, photograph.width, photograph.height))
         else:
             keys.append(photograph.name)
@@ -159,24 +167,28 @@ def _exif_key(photograph: Photograph) -> Hashable:
     return ("exif", exif.make, exif.model, exif.lens, photograph.width, photograph.height, *focal)
 
 
-def _uniform_folders(photographs: Sequence[Photograph]) -> set[str]:
-    """Folders whose images without EXIF look like those of one camera.
+def _shared_sizes(photographs: Sequence[Photograph]) -> set[tuple[str, tuple[int, int]]]:
+    """Folders and sides of images without EXIF that look like those of one camera.
 
     Portrait and landscape count as one size. Crowd photographs differ in size, or stand beside photographs
     that name several cameras.
     """
     bodies = defaultdict(set)
-    sizes = defaultdict(list)
+    counts: dict[str, Counter[tuple[int, int]]] = defaultdict(Counter)
     for photograph in photographs:
         if photograph.body:
             bodies[photograph.folder].add(photograph.body)
         else:
-            sizes[photograph.folder].append(tuple(sorted((photograph.width, photograph.height))))
-    return {
-        folder
-        for folder, all_sizes in sizes.items()
-        if len(bodies[folder]) <= 1 and len(set(all_sizes)) <= max(1, len(all_sizes) // IMAGES_PER_SIZE)
-    }
+            counts[photograph.folder][photograph.sides] += 1
+    shared = set()
+    for folder, sizes in counts.items():
+        if len(bodies[folder]) <= 1:
+            images = sizes.total()
+            few = len(sizes) <= max(1, images // IMAGES_PER_SIZE)
+            shared |= {
+                (folder, sides) for sides in sizes if few or sizes[sides] >= SHARE_OF_ONE_SIZE * images
+            }
+    return shared
 
 
 def _initial_focal(stated: Array, cropped: Array, default: float) -> tuple[float, str]:

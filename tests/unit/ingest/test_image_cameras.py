@@ -74,6 +74,14 @@ def test_two_videos_in_one_folder_are_two_cameras():
     assert group_sizes(photos("a", [(1920, 1080)] * 30 + [(1280, 720)] * 20)) == [20, 30]
 
 
+def test_a_few_strays_do_not_part_a_video():
+    video, strays = [(1280, 720)] * 5, [(500, 400), (640, 480)]
+    phone = [Photograph("a/phone.jpg", 300, 200, PHONE)]
+    assert group_sizes(photos("a", [*video, (720, 1280), *strays]) + phone) == [1, 1, 1, 1, 5]
+    # too many: as crowd photographs, whose commonest size is not of one camera
+    assert group_sizes(photos("a", video + strays) + phone) == [1] * 8
+
+
 def test_cropped_images_are_not_trusted():
     square = assign(photos("a", [(760, 760)] * 3, PHONE))
     assert len(square.cameras) == 3
