@@ -180,8 +180,15 @@ def test_the_server_ends_with_who_started_it(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_without_a_server_nothing_is_asked(parent: Command, address: str, tmp_path: Path) -> None:
+def test_jobs_go_on_when_the_server_is_killed(
+    parent: Command, address: str, ask: Callable[[str], Command], tmp_path: Path
+) -> None:
+    command, _ = waiting_job(parent, ask)
     os.kill(server_of(parent), signal.SIGKILL)
+    _, err = command.communicate(call_text(tmp_path / "out", tmp_path / "missing"), timeout=60)
+    assert command.returncode == 1
+    assert err.startswith("snakesfm: scene 's', index_images: ")
+    # the next ones do without
     script = Path(__file__).resolve().parents[2] / "scripts" / "index_images.py"
     for value in (address, str(tmp_path / "nothing"), NO_SERVER):
         done = subprocess.run(
@@ -193,8 +200,7 @@ def test_without_a_server_nothing_is_asked(parent: Command, address: str, tmp_pa
             timeout=60,
             check=False,
         )
-        assert done.returncode == 1
-        assert done.stderr.startswith("snakesfm: scene 's', index_images: ")
+        assert (done.returncode, done.stderr) == (1, err)
 
 
 def test_no_server_beside_another_one(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

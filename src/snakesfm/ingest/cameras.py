@@ -20,7 +20,7 @@ Sharing = Literal["auto", "exif", "single", "per_folder", "per_image"]
 MODELS_OF_ONE_SIZE = 5
 # images without EXIF are of one camera where at most one size comes with so many images
 IMAGES_PER_SIZE = 20
-# or those of one size where it is that of so many of them, beside a few strays
+# or those of one size where they are so many of a folder's images, beside a few strays
 SHARE_OF_ONE_SIZE = 0.75
 # 'auto' begins with it; adjust_bundle takes a wider model where a lens needs one
 FIRST_MODEL = "SIMPLE_RADIAL"
@@ -174,20 +174,19 @@ def _shared_sizes(photographs: Sequence[Photograph]) -> set[tuple[str, tuple[int
     that name several cameras.
     """
     bodies = defaultdict(set)
+    images: Counter[str] = Counter()
     counts: dict[str, Counter[tuple[int, int]]] = defaultdict(Counter)
     for photograph in photographs:
+        images[photograph.folder] += 1
         if photograph.body:
             bodies[photograph.folder].add(photograph.body)
         else:
             counts[photograph.folder][photograph.sides] += 1
     shared = set()
     for folder, sizes in counts.items():
-        if len(bodies[folder]) <= 1:
-            images = sizes.total()
-            few = len(sizes) <= max(1, images // IMAGES_PER_SIZE)
-            shared |= {
-                (folder, sides) for sides in sizes if few or sizes[sides] >= SHARE_OF_ONE_SIZE * images
-            }
+        few = len(bodies[folder]) <= 1 and len(sizes) <= max(1, sizes.total() // IMAGES_PER_SIZE)
+        most = SHARE_OF_ONE_SIZE * images[folder]
+        shared |= {(folder, sides) for sides, count in sizes.items() if few or count >= most}
     return shared
 
 

@@ -75,11 +75,11 @@ def test_two_videos_in_one_folder_are_two_cameras():
 
 
 def test_a_few_strays_do_not_part_a_video():
-    video, strays = [(1280, 720)] * 5, [(500, 400), (640, 480)]
-    phone = [Photograph("a/phone.jpg", 300, 200, PHONE)]
-    assert group_sizes(photos("a", [*video, (720, 1280), *strays]) + phone) == [1, 1, 1, 1, 5]
+    video, strays = [(1280, 720)] * 11, [(500, 400), (640, 480)]
+    phones = [Photograph(f"a/{name}.jpg", 300, 200, Exif("X", name)) for name in "bc"]
+    assert group_sizes(photos("a", [*video, (720, 1280), *strays]) + phones) == [1] * 5 + [11]
     # too many: as crowd photographs, whose commonest size is not of one camera
-    assert group_sizes(photos("a", video + strays) + phone) == [1] * 8
+    assert group_sizes(photos("a", video + strays) + phones) == [1] * 15
 
 
 def test_cropped_images_are_not_trusted():
