@@ -8,7 +8,7 @@ from snakesfm.config.base import StageOptions
 class ExportModelOptions(StageOptions):
     """How the model is written for other tools."""
 
-    stage_version: ClassVar[int] = 2
+    stage_version: ClassVar[int] = 3
 
     georeference: Literal["auto"] | bool = "auto"
     """Move models to metres east, north and up by the GPS in EXIF; 'auto': where the two agree."""
@@ -17,4 +17,4 @@ class ExportModelOptions(StageOptions):
     """Link the images beside the model, so that 3DGS and nerfstudio tools read the folder as it is."""
 
     undistort: bool = False
-    """Also write images and model with PINHOLE cameras, in 'undistorted', for tools that need these."""
+    """Also write images, masks and model of PINHOLE cameras, in 'undistorted', for tools that need these."""

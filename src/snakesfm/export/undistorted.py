@@ -1,20 +1,30 @@
-"""Images without distortion, and the model that belongs to them."""
+"""Images without distortion, and the model and the masks that belong to them."""
 
 import shutil
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+import cv2
+import numpy as np
+
 from snakesfm.geometry.colmap_binding import pycolmap
+from snakesfm.ingest.masks import find_mask, read_mask
 
 
-def write_undistorted(target: Path, sparse: Path, images: Path, threads: int) -> None:
+def write_undistorted(target: Path, sparse: Path, images: Path, masks: Path | None, threads: int) -> None:
     """Write ``target``/images and ``target``/sparse/0 with PINHOLE cameras, for tools that know no other.
 
     Parameters
     ----------
     target : folder to make.
     sparse : folder of the COLMAP model.
-    images : folder of the upright images, by the model's names.
+    images : folder of the images as they are stored, by the model's names.
+    masks : folder of masks, which go to ``target``/masks, named as in COLMAP; None without.
     threads : how many images to work on at once.
+
+    Raises
+    ------
+    ConfigError : a mask cannot be used.
     """
     pycolmap.undistort_images(str(target), str(sparse), str(images), num_threads=threads)
     flat = target / "sparse"
@@ -25,3 +35,30 @@ def write_undistorted(target: Path, sparse: Path, images: Path, threads: int) ->
     shutil.rmtree(target / "stereo")
     for script in target.glob("run-colmap-*.sh"):
         script.unlink()
+    if masks is not None:
+        _write_masks(target / "masks", sparse, masks, threads)
+
+
+def _write_masks(target: Path, sparse: Path, masks: Path, threads: int) -> None:
+    """Undistort the masks of the images that have one, as their images are."""
+    options = pycolmap.UndistortCameraOptions()
+    # a mask knows no gray
+    nearest = type(options.warp_options.interpolation).NEAREST_NEIGHBOR
+    options.warp_options.interpolation = nearest
+    model = pycolmap.Reconstruction(str(sparse))
+
+    def write(image: "pycolmap.Image") -> None:
+        mask = find_mask(masks, image.name)
+        if mask is None:
+            return
+        camera = model.cameras[image.camera_id]
+        size = camera.width, camera.height
+        shown = 255 * read_mask(mask, size).astype(np.uint8)
+        shown = cv2.resize(shown, size, interpolation=cv2.INTER_NEAREST)
+        bitmap, _ = pycolmap.undistort_image(options, pycolmap.Bitmap.from_array(shown), camera)
+        file = target / f"{image.name}.png"
+        file.parent.mkdir(parents=True, exist_ok=True)
+        bitmap.write(str(file))
+
+    with ThreadPoolExecutor(threads) as pool:
+        list(pool.map(write, [model.images[image_id] for image_id in model.reg_image_ids()]))

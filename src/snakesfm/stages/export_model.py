@@ -117,7 +117,14 @@ def run(job: StageJob) -> None:
         elif (folder / "masks").is_symlink():
             (folder / "masks").unlink()
         if options.undistort:
-            write_undistorted(temporary / UNDISTORTED, sparse / "0", folder / "images", job.threads)
+            given = job.settings.get("masks")
+            write_undistorted(
+                temporary / UNDISTORTED,
+                sparse / "0",
+                folder / "images",
+                Path(given) if given else None,
+                job.threads,
+            )
         shutil.rmtree(folder / UNDISTORTED, ignore_errors=True)
         for former in (folder / "sparse").glob("[1-9]*"):
             shutil.rmtree(former)

@@ -4,6 +4,7 @@ import csv
 import dataclasses
 import json
 import struct
+import sys
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -360,8 +361,39 @@ def test_undistorted_images_have_pinhole_cameras_and_go_when_no_longer_asked_for
     assert model.num_reg_images() == COUNT - 1
     assert model.num_points3D() == len(problem.points)
     assert len(list((folder / "undistorted" / "images").rglob("*.jpg"))) == COUNT - 1
+    assert not (folder / "undistorted" / "masks").exists()
     export(tmp_path, problem)
     assert not (folder / "undistorted").exists()
+
+
+def test_masks_are_undistorted_as_their_images_are(
+    tmp_path, problem, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lens = dataclasses.replace(CAMERA, params=(*CAMERA.params[:3], 0.3))
+    monkeypatch.setattr(sys.modules[__name__], "CAMERA", lens)
+    photos, masks = tmp_path / "photos", tmp_path / "masks"
+    height, width = 480, 640
+    shown = np.zeros((height, width), np.uint8)
+    cv2.circle(shown, (200, 150), 120, 255, -1)
+    for name in NAMES:
+        (photos / name).parent.mkdir(parents=True, exist_ok=True)
+        Image.fromarray(np.repeat(shown[..., None], 3, axis=2)).save(photos / name, quality=95)
+    (masks / NAMES[0]).parent.mkdir(parents=True, exist_ok=True)
+    cv2.imwrite(str(masks / f"{NAMES[0]}.png"), shown)
+    # of another size, and named in the other way
+    small = cv2.resize(shown, (width // 2, height // 2), interpolation=cv2.INTER_NEAREST)
+    cv2.imwrite(str((masks / NAMES[1]).with_suffix(".png")), small)
+    folder = export(tmp_path, problem, masks=masks, undistort=True) / "undistorted"
+    found = sorted(path.relative_to(folder / "masks").as_posix() for path in folder.rglob("*.png"))
+    assert found == sorted(f"{name}.png" for name in NAMES[:2])
+    for name, most in ((NAMES[0], 0.002), (NAMES[1], 0.01)):
+        image = cv2.imread(str(folder / "images" / name), cv2.IMREAD_GRAYSCALE)
+        mask = cv2.imread(str(folder / "masks" / f"{name}.png"), cv2.IMREAD_UNCHANGED)
+        assert mask.shape == image.shape
+        assert set(np.unique(mask)) == {0, 255}
+        assert np.mean((image > 127) != (mask > 0)) < most
+    # the lens moves the circle's edge
+    assert np.mean((cv2.resize(shown, image.shape[::-1]) > 127) != (image > 127)) > 0.02
 
 
 def test_the_binary_files_have_the_layout_of_colmap_3(tmp_path, problem) -> None:
