@@ -17,4 +17,4 @@ class ExportModelOptions(StageOptions):
     """Link the images beside the model, so that 3DGS and nerfstudio tools read the folder as it is."""
 
     undistort: bool = False
-    """Also write images, masks and model of PINHOLE cameras, in 'undistorted', for tools that need these."""
+    """Also write images, masks and model with PINHOLE cameras, in 'undistorted', for some tools."""
