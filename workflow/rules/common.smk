@@ -10,8 +10,8 @@ from snakemake.settings.types import DeploymentMethod, Quietness
 
 from snakesfm import resources, slurm
 from snakesfm.errors import SnakesfmError
-from snakesfm.job_server import JobServer
 from snakesfm.blocks import tile_names
+from snakesfm.job_server import JobServer
 from snakesfm.plan import Plan
 from snakesfm.records import makes_nothing
 from snakesfm.run import Run
@@ -257,12 +257,12 @@ def start_run():
     slurm_run = getattr(executor, "run_uuid", "")
     if slurm_run:
         slurm.steady(executor)
-    if workflow.local_exec and not workflow.deployment_settings.deployment_method:
-        JOB_SERVER.start(MALLOC)
     try:
         RUN.start(slurm_run)
     except SnakesfmError as error:
         raise refusal(error) from None
+    if workflow.local_exec and not workflow.deployment_settings.deployment_method:
+        JOB_SERVER.start(MALLOC)
 
 
 def finish_run(log):
