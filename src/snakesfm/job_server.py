@@ -46,7 +46,8 @@ class JobServer:
     def start(self, variables: Mapping[str, str]) -> None:
         """Start the server and have the jobs of this process ask it.
 
-        Does nothing where the environment already names a server, or ``off`` for none.
+        Does nothing where the environment already names a server, or ``off`` for none, and where there is
+        no room for temporary files or another process.
 
         Parameters
         ----------
@@ -54,17 +55,18 @@ class JobServer:
         """
         if VARIABLE in os.environ:
             return
-        # a folder that nobody else can enter
-        address = str(Path(tempfile.mkdtemp(prefix="snakesfm-")) / "jobs")
-        # this end of the pipe stays open until this process ends, however it ends
-        self.process = subprocess.Popen(
-            [sys.executable, "-P", "-m", "snakesfm.job_server", address],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-            env={**os.environ, **variables},
-        )
-        os.environ[VARIABLE] = address
+        with contextlib.suppress(OSError):
+            # a folder that nobody else can enter
+            address = str(Path(tempfile.mkdtemp(prefix="snakesfm-")) / "jobs")
+            # this end of the pipe stays open until this process ends, however it ends
+            self.process = subprocess.Popen(
+                [sys.executable, "-P", "-m", "snakesfm.job_server", address],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.DEVNULL,
+                stderr=subprocess.DEVNULL,
+                env={**os.environ, **variables},
+            )
+            os.environ[VARIABLE] = address
 
     def stop(self) -> None:
         """End the server, whose processor time and that of its jobs then counts as this process's."""

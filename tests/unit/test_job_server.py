@@ -209,3 +209,13 @@ def test_no_server_beside_another_one(monkeypatch: pytest.MonkeyPatch, tmp_path:
     JobServer().start({})
     assert os.environ[VARIABLE] == NO_SERVER
     assert list(tmp_path.iterdir()) == []
+
+
+def test_no_server_where_there_is_no_room_for_one(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.delenv(VARIABLE, raising=False)
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "missing"))
+    server = JobServer()
+    server.start({})
+    server.stop()
+    assert server.process is None
+    assert VARIABLE not in os.environ
