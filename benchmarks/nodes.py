@@ -20,7 +20,7 @@ from pathlib import Path
 
 from benchmarks import ROOT, SOURCES
 from benchmarks.marked_tables import replace_table
-from snakesfm.job_logs import DONE
+from snakesfm.job_logs import find_cost
 from snakesfm.synthetic.render_demo import make_demo
 from snakesfm.synthetic.scene import DemoOptions
 from tests.slurm_cluster import Cluster, missing_programs
@@ -91,8 +91,8 @@ def run_workflow(scene: Path, folder: Path, cluster: Cluster | None) -> NodesRun
     wall, busy = time.monotonic() - started, busy_seconds() - busy
     if done.returncode:
         raise SystemExit(f"{done.stdout}\nThe workflow failed with status {done.returncode}; see above.")
-    found = [DONE.findall(log.read_text("utf-8")) for log in folder.glob("out/*/logs/*/*.log")]
-    stages = sum(float(lines[-1][3]) for lines in found if lines)
+    found = [find_cost(log.read_text("utf-8")) for log in folder.glob("out/*/logs/*/*.log")]
+    stages = sum(float(cost["cpu"]) for cost in found if cost)
     jobs = len(cluster.jobs("COMPLETED")) - earlier if cluster else 0
     return NodesRun(len(cluster.names) if cluster else 0, wall, busy, stages, jobs, others)
 

@@ -12,7 +12,7 @@ from pathlib import Path
 from benchmarks import ROOT
 from benchmarks.compare.measure import Cost, run_measured, run_operation
 from benchmarks.compare.sets import ImageSet
-from snakesfm.job_logs import DONE
+from snakesfm.job_logs import find_cost
 
 FEATURES = 5000
 EXTRACT = (
@@ -32,7 +32,7 @@ MAP = (
     "triangulate_tracks",
     "adjust_bundle",
 )
-STARTED = re.compile(r"^(\d{4}-\d\d-\d\dT\S+) (\w+) (?!done in )", re.M)
+STARTED = re.compile(r"^(\d{4}-\d\d-\d\dT\S+) \w+ (?!done in )", re.M)
 
 
 def snakesfm(
@@ -67,12 +67,12 @@ def stage_costs(logs: Path, whole: Cost) -> dict[str, Cost]:
     """
     jobs = {path: path.read_text("utf-8") for path in logs.glob("*/*.log")}
     costs: dict[str, Cost] = {}
-    since = min(_clock(found[1]) for text in jobs.values() if (found := _last(STARTED, text)))
+    since = min(_clock(found[-1]) for text in jobs.values() if (found := STARTED.findall(text)))
     for name, stages in (("extract", EXTRACT), ("match", MATCH), ("map", MAP)):
         ends = [
             found
             for path, text in jobs.items()
-            if path.parent.name in stages and (found := _last(DONE, text))
+            if path.parent.name in stages and (found := find_cost(text))
         ]
         until = max((_clock(found["clock"]) for found in ends), default=since)
         cpu_seconds = sum(float(found["cpu"]) for found in ends)
@@ -80,13 +80,6 @@ def stage_costs(logs: Path, whole: Cost) -> dict[str, Cost]:
         costs[name] = Cost(round(until - since, 2), round(cpu_seconds, 2), peak_mib, whole.others)
         since = until
     return costs
-
-
-def _last(pattern: re.Pattern[str], text: str) -> re.Match[str] | None:
-    found = None
-    for found in pattern.finditer(text):  # noqa: B007
-        pass
-    return found
 
 
 def _clock(text: str) -> float:

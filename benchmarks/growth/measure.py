@@ -14,7 +14,7 @@ import yaml
 
 from benchmarks import NO_FORKS, ROOT, SOURCES
 from snakesfm.blocks import choose_blocks
-from snakesfm.job_logs import DONE
+from snakesfm.job_logs import find_cost
 from snakesfm.simulate import Simulation, SimulationOptions
 
 TILED = ("match_pairs", "estimate_two_view")
@@ -110,19 +110,19 @@ def collect(options: SimulationOptions, folder: Path) -> Measurement:
     scene = folder / "results" / config["scene"]
     result = Measurement(options.survey, options.images, int(config["blocks"]), options.until)
     for log in sorted(scene.glob("logs/*/*.log")):
-        found = DONE.findall(log.read_text("utf-8"))
+        found = find_cost(log.read_text("utf-8"))
         if not found:
             continue
-        _, stage, seconds, cpu, mb = found[-1]
+        stage, cpu = found["stage"], float(found["cpu"])
         need = result.stages.setdefault(stage, StageNeed())
         artifact = scene / stage / f"{log.stem}.h5"
         if stage in TILED and artifact.is_file():
             need.pairs += _count_pairs(artifact)
         need.jobs += 1
-        need.seconds += float(seconds)
-        need.cpu += float(cpu)
-        need.most_cpu = max(need.most_cpu, float(cpu))
-        need.most_mb = max(need.most_mb, float(mb))
+        need.seconds += float(found["seconds"])
+        need.cpu += cpu
+        need.most_cpu = max(need.most_cpu, cpu)
+        need.most_mb = max(need.most_mb, float(found["mb"]))
     listed = folder / "pairs.txt"
     if listed.is_file():
         result.pairs = len(listed.read_text("utf-8").splitlines())

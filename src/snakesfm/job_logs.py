@@ -31,6 +31,14 @@ def clock(seconds: float) -> str:
     return time.strftime("%Y-%m-%dT%H:%M:%S", time.localtime(seconds)) + f".{int(seconds % 1 * 1000):03d}"
 
 
+def find_cost(text: str) -> re.Match[str] | None:
+    """What ``DONE`` finds in a job's log, of the last run of several; None where none ended."""
+    found = None
+    for found in DONE.finditer(text):  # noqa: B007
+        pass
+    return found
+
+
 def stage_costs(logs: Iterable[str]) -> dict[str, tuple[float, float]]:
     """Seconds (sum over jobs) and peak memory in MB (largest job) of each stage.
 
@@ -40,9 +48,8 @@ def stage_costs(logs: Iterable[str]) -> dict[str, tuple[float, float]]:
     """
     costs: dict[str, tuple[float, float]] = {}
     for text in logs:
-        found = DONE.findall(text)
+        found = find_cost(text)
         if found:
-            _, stage, seconds, _, mb = found[-1]
-            sum_s, most_mb = costs.get(stage, (0.0, 0.0))
-            costs[stage] = sum_s + float(seconds), max(most_mb, float(mb))
+            sum_s, most_mb = costs.get(found["stage"], (0.0, 0.0))
+            costs[found["stage"]] = sum_s + float(found["seconds"]), max(most_mb, float(found["mb"]))
     return costs

@@ -81,8 +81,8 @@ def serve(address: str) -> None:
     ----------
     address : path of the socket, in a folder of its own; both are removed in the end.
     """
-    # an interrupt from the terminal is for the jobs
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    # an interrupt from the terminal is for the jobs, also for one that is just being forked
+    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         _load_libraries()
         with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as listener:
@@ -124,7 +124,7 @@ def _become_job(connection: socket.socket) -> None:
     try:
         request, streams, _, _ = socket.recv_fds(connection, LARGEST_REQUEST, 3)
         _end_with(connection)
-        signal.signal(signal.SIGINT, signal.default_int_handler)
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
         for target, stream in enumerate(streams):
             os.dup2(stream, target)
             os.close(stream)

@@ -4,6 +4,7 @@ Imports no more than it needs to ask the server, as this is what each job waits 
 """
 
 import os
+import signal
 import socket
 import sys
 
@@ -47,6 +48,8 @@ def fork_job(stage: str) -> int | None:
             socket.send_fds(server, [request], [0, 1, 2])
         except OSError:
             return None
+        # an interrupt from the terminal reaches the job too, which ends by it and says so
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
         try:
             # a job that is killed says nothing
             return int(server.recv(16) or b"1")

@@ -105,6 +105,13 @@ def waiting_job(parent: Command, ask: Callable[[str], Command]) -> tuple[Command
     return command, next(job for job in children(server) if not has_ended(job))
 
 
+def signal_job(command: Command, job: int, number: int) -> tuple[int, str]:
+    """The status of a job's command after the job got a signal, and what the two said on the terminal."""
+    os.kill(job, number)
+    out, err = command.communicate(timeout=10)
+    return command.returncode, out + err
+
+
 def has_ended(pid: int) -> bool:
     """Also of one that the server has not asked after yet."""
     try:
@@ -142,9 +149,7 @@ def test_a_job_has_the_streams_and_the_status_of_its_command(ask, tmp_path: Path
 
 def test_a_killed_job_fails_its_command(parent: Command, ask) -> None:
     client, job = waiting_job(parent, ask)
-    os.kill(job, signal.SIGKILL)
-    client.communicate(timeout=10)
-    assert client.returncode == 1
+    assert signal_job(client, job, signal.SIGKILL) == (1, "")
 
 
 def test_a_job_ends_with_its_command(parent: Command, ask) -> None:
@@ -153,18 +158,15 @@ def test_a_job_ends_with_its_command(parent: Command, ask) -> None:
     wait_until(lambda: has_ended(job))
     # and the server goes on
     again, other = waiting_job(parent, ask)
-    os.kill(other, signal.SIGTERM)
-    again.communicate(timeout=10)
-    assert again.returncode == 1
+    assert signal_job(again, other, signal.SIGTERM)[0] == 1
 
 
 def test_an_interrupt_ends_jobs_and_not_the_server(parent: Command, ask) -> None:
     client, job = waiting_job(parent, ask)
     server = server_of(parent)
-    for pid in (server, job):
+    for pid in (server, client.pid):
         os.kill(pid, signal.SIGINT)
-    client.communicate(timeout=10)
-    assert client.returncode == 130
+    assert signal_job(client, job, signal.SIGINT) == (130, "")
     assert not has_ended(server)
 
 

@@ -83,7 +83,9 @@ def run(job: StageJob) -> None:
         warnings.append(REFUSED.format(count=len(index.refused_names), first=index.refused_reasons[0]))
     if job.options.georeference is True and place is None:
         warnings.append(NO_PLACE)
-    masks = _masks(job, {names[row]: cameras[index.camera_ids[row]] for row in registered}, warnings)
+    given_masks = Path(job.settings["masks"]) if "masks" in job.settings else None
+    of_image = {names[row]: cameras[index.camera_ids[row]] for row in registered}
+    masks = _masks(given_masks, of_image, warnings)
     for line in warnings:
         sys.stderr.write(f"warning: {line}\n")
     folder = _export_folder(job)
@@ -111,19 +113,14 @@ def run(job: StageJob) -> None:
         options: ExportModelOptions = job.options
         if options.link_images or options.undistort:
             place_images(folder / "images", Path(job.settings["images"]), names, index.orientations)
-        if options.link_images and masks:
+        if options.link_images and given_masks is not None and masks:
             upright = np.ones(len(masks), np.int32)
-            place_images(folder / "masks", Path(job.settings["masks"]), list(masks.values()), upright)
+            place_images(folder / "masks", given_masks, list(masks.values()), upright)
         elif (folder / "masks").is_symlink():
             (folder / "masks").unlink()
         if options.undistort:
-            given = job.settings.get("masks")
             write_undistorted(
-                temporary / UNDISTORTED,
-                sparse / "0",
-                folder / "images",
-                Path(given) if given else None,
-                job.threads,
+                temporary / UNDISTORTED, sparse / "0", folder / "images", given_masks, job.threads
             )
         shutil.rmtree(folder / UNDISTORTED, ignore_errors=True)
         for former in (folder / "sparse").glob("[1-9]*"):
@@ -147,12 +144,12 @@ def _lens_warnings(model: Reconstruction, cameras: list[Camera], camera_ids: np.
     ]
 
 
-def _masks(job: StageJob, cameras: dict[str, Camera], warnings: list[str]) -> dict[str, str]:
+def _masks(folder: Path | None, cameras: dict[str, Camera], warnings: list[str]) -> dict[str, str]:
     """The masks of all images, given with their cameras; none and a warning where some are missing."""
-    if "masks" not in job.settings:
+    if folder is None:
         return {}
     sizes = {name: (camera.width, camera.height) for name, camera in cameras.items()}
-    masks = masks_as_large(Path(job.settings["masks"]), sizes)
+    masks = masks_as_large(folder, sizes)
     missing = sorted(sizes.keys() - masks.keys())
     if missing:
         warnings.append(MISSING_MASKS.format(count=len(missing), first=missing[0]))
