@@ -1,6 +1,7 @@
 """What is taken out of the model between rounds: observations, points, images, and intrinsics gone wild."""
 
 import heapq
+from collections import Counter
 from collections.abc import Collection, Sequence
 
 import cv2  # noqa: F401 - must be loaded before pycolmap, whose PNG library clashes otherwise
@@ -12,7 +13,11 @@ USUAL_FOCAL_RATIO = 1.2
 
 
 def filter_observations(
-    reconstruction: pycolmap.Reconstruction, max_error_px: float, min_angle_deg: float, min_length: int = 2
+    reconstruction: pycolmap.Reconstruction,
+    max_error_px: float,
+    min_angle_deg: float,
+    min_length: int = 2,
+    sparse_observations: int = 0,
 ) -> int:
     """Drop observations with large errors, points with nearly parallel rays, and points too short.
 
@@ -21,7 +26,7 @@ def filter_observations(
     reconstruction : changed in place.
     max_error_px : observations with larger errors, or behind the camera, are dropped one by one.
     min_angle_deg : points whose widest rays meet at less are dropped.
-    min_length : observations that a point must have.
+    min_length, sparse_observations : see :func:`drop_short_tracks`.
 
     Returns
     -------
@@ -29,14 +34,37 @@ def filter_observations(
     """
     before = reconstruction.compute_num_observations()
     pycolmap.ObservationManager(reconstruction).filter_all_points3D(max_error_px, min_angle_deg)
-    drop_short_tracks(reconstruction, min_length)
+    drop_short_tracks(reconstruction, min_length, sparse_observations)
     return int(before - reconstruction.compute_num_observations())
 
 
-def drop_short_tracks(reconstruction: pycolmap.Reconstruction, min_length: int) -> None:
-    """Drop points with fewer than ``min_length`` observations."""
-    if min_length > 2:
-        pycolmap.ObservationManager(reconstruction).filter_points3D_with_short_tracks(min_length)
+def drop_short_tracks(
+    reconstruction: pycolmap.Reconstruction, min_length: int, sparse_observations: int = 0
+) -> None:
+    """Drop points that too few images observe, but for those of images that see few others.
+
+    Parameters
+    ----------
+    reconstruction : changed in place.
+    min_length : observations that a point must have.
+    sparse_observations : an image with fewer observations of such points keeps its shorter tracks too.
+    """
+    if min_length <= 2:
+        return
+    short = {
+        point_id: {element.image_id for element in point.track.elements}
+        for point_id, point in reconstruction.points3D.items()
+        if point.track.length() < min_length
+    }
+    of_short = Counter(image_id for images in short.values() for image_id in images)
+    sparse = {
+        image_id
+        for image_id in reconstruction.reg_image_ids()
+        if reconstruction.image(image_id).num_points3D - of_short[image_id] < sparse_observations
+    }
+    for point_id, images in short.items():
+        if not images & sparse:
+            reconstruction.delete_point3D(point_id)
 
 
 def deregister_weak_images(reconstruction: pycolmap.Reconstruction, min_observations: int) -> list[int]:

@@ -72,6 +72,7 @@ class RoundSettings:
     register_error_px: float = 6.0
     min_angle_deg: float = 1.0
     min_track_length: int = 3
+    sparse_observations: int = 100
     min_observations: int = 10
     select_above_images: int = 500
     early_observations: int = 300
@@ -204,7 +205,7 @@ class _Mapper:
                 refine_distortion=solving.refine_distortion
                 and len(self.records) + 1 >= settings.distortion_from_round,
             )
-        drop_short_tracks(self.reconstruction, settings.min_track_length)
+        drop_short_tracks(self.reconstruction, settings.min_track_length, settings.sparse_observations)
         costs = self.solve(solving, phase)
         wild = reset_wild_cameras(
             self.reconstruction,
@@ -219,9 +220,7 @@ class _Mapper:
                 wild = deregister_images_alone(self.reconstruction, wild)
             held = solving.constant_cameras | wild
             costs = self.solve(replace(solving, constant_cameras=held), phase)
-        filter_observations(
-            self.reconstruction, threshold_px, settings.min_angle_deg, settings.min_track_length
-        )
+        self.filter(threshold_px)
         if phase != "early":
             deregister_weak_images(self.reconstruction, settings.min_observations)
         self.record(name, costs)
@@ -303,11 +302,17 @@ class _Mapper:
     def drop_outliers(self) -> None:
         """Drop observations so far off that the keypoints' noise does not explain them."""
         settings = self.settings
+        self.filter(max(settings.outlier_sigmas * keypoint_noise_px(self.reconstruction), EXACT_PX))
+
+    def filter(self, max_error_px: float) -> None:
+        """Drop observations with larger errors, and the points that do not hold without them."""
+        settings = self.settings
         filter_observations(
             self.reconstruction,
-            max(settings.outlier_sigmas * keypoint_noise_px(self.reconstruction), EXACT_PX),
+            max_error_px,
             settings.min_angle_deg,
             settings.min_track_length,
+            settings.sparse_observations,
         )
 
     def loss_scale_px(self) -> float:

@@ -11,7 +11,7 @@ from snakesfm.config.base import StageOptions
 class AdjustBundleOptions(StageOptions):
     """How cameras, poses and points are adjusted together."""
 
-    stage_version: ClassVar[int] = 13
+    stage_version: ClassVar[int] = 14
 
     solver: Literal["ceres", "gtsam"] = "ceres"
     """Least-squares solver: Ceres through pycolmap, or gtsam (slower, fewer camera models)."""
@@ -110,6 +110,9 @@ class AdjustBundleOptions(StageOptions):
 
     min_track_length: int = Field(default=3, ge=2)
     """Observations that a point must have to take part; 2 where only two images are posed."""
+
+    sparse_observations: int = Field(default=100, ge=0)
+    """An image with fewer observations of such points keeps its points of two images too."""
 
     min_observations: int = Field(default=10, ge=0)
     """Observations that an image must have to stay registered."""

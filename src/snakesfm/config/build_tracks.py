@@ -10,10 +10,13 @@ from snakesfm.config.base import StageOptions
 class BuildTracksOptions(StageOptions):
     """How matches are joined to tracks."""
 
-    stage_version: ClassVar[int] = 5
+    stage_version: ClassVar[int] = 6
 
     min_length: int = Field(default=3, ge=2)
     """Images that a track must be seen in; 2 where only two images have a rotation."""
+
+    sparse_observations: int = Field(default=100, ge=0)
+    """An image with fewer observations of such tracks keeps its tracks of two images too."""
 
     merge_radius_px: float = Field(default=1.0, ge=0.0, le=20.0)
     """Keypoints of one image nearer than this count as one observation of a track."""

@@ -15,7 +15,7 @@ SHORTLIST = 100
 class SelectPairsOptions(StageOptions):
     """Which pairs of images are matched."""
 
-    stage_version: ClassVar[int] = 2
+    stage_version: ClassVar[int] = 3
 
     method: Literal[
         "auto",
@@ -46,6 +46,9 @@ class SelectPairsOptions(StageOptions):
 
     min_likeness: float = Field(1.5, ge=0.0)
     """Least resemblance of these keypoints in a pair that is matched; higher leaves more pairs out."""
+
+    least_partners: int = Field(16, ge=0, le=10_000)
+    """Partners that each image keeps, the most alike ones, however little they resemble it."""
 
     enough_partners: int = Field(30, ge=0, le=10_000)
     """Partners that each image keeps: half the most alike, half every second of the next (0: all)."""

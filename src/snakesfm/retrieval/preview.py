@@ -73,6 +73,25 @@ def look_at_pairs(pairs: Array, previews: Sequence[Array | None], threads: int =
     return np.concatenate([np.asarray(values, np.float32) for values in found])
 
 
+def alike_pairs(pairs: Array, likenesses: Array, min_likeness: float, least_partners: int) -> Array:
+    """Which pairs (P,) bool are alike enough, or among the most alike ones of an image.
+
+    Where photographs overlap little, the largest keypoints of many neighbours resemble each other as
+    little as strangers' do.
+
+    Parameters
+    ----------
+    pairs : (P,2) rows of images, distinct.
+    likenesses : (P,) as :func:`look_at_pairs` has them; a pair without one stays and counts as none.
+    min_likeness : what is enough.
+    least_partners : of each image so many stay however little they resemble it.
+    """
+    stays = ~(likenesses < min_likeness)
+    rows, _, ranks, _ = _ranked(pairs, likenesses, np.flatnonzero(~np.isnan(likenesses)))
+    stays[rows[ranks < least_partners]] = True
+    return stays
+
+
 def choose_partners(pairs: Array, likenesses: Array, enough_partners: int, enough_likeness: float) -> Array:
     """Which pairs stay where each image needs only so many partners; a pair stays if either image keeps it.
 

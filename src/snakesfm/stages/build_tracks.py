@@ -45,6 +45,7 @@ def run(job: StageJob) -> None:
         offsets,
         matches,
         min_length=min(options.min_length, max(2, int(registered.sum()))),
+        sparse_observations=options.sparse_observations,
         merge_radius_px=options.merge_radius_px,
         split=options.split_conflicts,
     )

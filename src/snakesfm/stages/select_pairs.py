@@ -20,7 +20,7 @@ from snakesfm.retrieval.pairs import (
     similar_pairs,
     spatial_pairs,
 )
-from snakesfm.retrieval.preview import choose_partners, largest_keypoints, look_at_pairs
+from snakesfm.retrieval.preview import alike_pairs, choose_partners, largest_keypoints, look_at_pairs
 from snakesfm.stages.job import StageJob
 
 if TYPE_CHECKING:
@@ -75,7 +75,7 @@ def _look(
         part = slice(start, start + LOOKS_AT_ONCE)
         likenesses[part] = look_at_pairs(table.pairs[part], previews, job.threads)
         progress.step(len(likenesses[part]))
-    stays = ~(likenesses < options.min_likeness)
+    stays = alike_pairs(table.pairs, likenesses, options.min_likeness, options.least_partners)
     if options.enough_partners:
         rows, enough = np.flatnonzero(stays), (options.enough_partners, options.enough_likeness)
         stays[rows] = choose_partners(table.pairs[rows], likenesses[rows], *enough)

@@ -39,6 +39,7 @@ def build_tracks(
     min_length: int = 3,
     merge_radius_px: float = 1.0,
     split: bool = False,
+    sparse_observations: int = 0,
 ) -> Tracks:
     """Join matches to tracks that see each image at most once.
 
@@ -57,6 +58,7 @@ def build_tracks(
     min_length : images that a track must be seen in.
     merge_radius_px : keypoints of one image within this distance are one observation.
     split : split conflicting components; otherwise they are dropped.
+    sparse_observations : an image with fewer observations of such tracks keeps its shorter ones too.
 
     Returns
     -------
@@ -92,7 +94,13 @@ def build_tracks(
         apart = split_conflicts(sub, strengths, images[rows], positions[rows], merge_radius_px)
         labels[rows] = labels.max() + 1 + apart
     observed = _one_per_image(labels, images, np.bincount(links.ravel(), minlength=len(nodes)))
-    return _assemble(labels, parts, images, nodes - base[images], observed, min_length, conflicts)
+    labels, parts, images = labels[observed], parts[observed], images[observed]
+    rows = nodes[observed] - base[images]
+    long = np.bincount(labels)[labels] >= min_length
+    sparse = np.bincount(images[long], minlength=len(keypoints)) < sparse_observations
+    wanted = np.bincount(labels, weights=sparse[images])[labels] > 0
+    several = np.bincount(labels)[labels] >= 2
+    return _assemble(labels, parts, images, rows, long | (wanted & several), conflicts)
 
 
 def _components(links: Array, count: int) -> Array:
@@ -128,22 +136,13 @@ def _one_per_image(labels: Array, images: Array, degrees: Array) -> Array:
 
 
 def _assemble(
-    labels: Array,
-    parts: Array,
-    images: Array,
-    rows: Array,
-    observed: Array,
-    min_length: int,
-    conflicts: int,
+    labels: Array, parts: Array, images: Array, rows: Array, kept: Array, conflicts: int
 ) -> Tracks:
-    labels, parts, images, rows = labels[observed], parts[observed], images[observed], rows[observed]
-    lengths = np.bincount(labels)
     # nodes ascend by image and keypoint, so a track's first node is its first observation
-    first = np.zeros(len(lengths), dtype=np.int64)
+    first = np.zeros(int(labels.max(initial=-1)) + 1, dtype=np.int64)
     first[labels[::-1]] = np.arange(len(labels))[::-1]
     rank = first[labels]
-    keep = lengths[labels] >= min_length
-    order = np.nonzero(keep)[0]
+    order = np.nonzero(kept)[0]
     order = order[np.argsort(rank[order], kind="stable")]
     starts = np.r_[True, np.diff(rank[order]) != 0][: len(order)]
     offsets = np.r_[np.nonzero(starts)[0], len(order)].astype(np.int64)

@@ -5,12 +5,14 @@ edge see a landmark at a depth that is known up to the edge's baseline; two edge
 landmark so compare their baselines. Nothing is drawn at random and nothing is non-convex but the weights.
 """
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from snakesfm.geometry.sparse_systems import conjugate_gradients
+from snakesfm.translation_averaging.clusters import join_clusters
 from snakesfm.translation_averaging.landmarks import sum_by
 from snakesfm.translation_averaging.problem import PositioningProblem
 
@@ -105,6 +107,8 @@ def epipolar_rad(
 def chain_centers(problem: PositioningProblem, scale_rad: float, edges_per_camera: int = 8) -> Array:
     """Centres (N,3) from the baselines of the edges; NaN where an image hangs on no edge that has one.
 
+    Parts whose baselines no landmark compares with those of the largest are joined to it by their edges.
+
     Parameters
     ----------
     problem : with rays.
@@ -128,16 +132,42 @@ def chain_centers(problem: PositioningProblem, scale_rad: float, edges_per_camer
     strength = np.bincount(edges, weights=information, minlength=len(problem.pairs))
     taken = _strongest(problem.pairs, strength, problem.image_count, edges_per_camera)
     keep = taken[edges]
-    baselines = _log_baselines(
-        np.concatenate([edges[keep], edges[keep]]),
-        np.concatenate([left[keep], right[keep]]),
-        np.log(np.concatenate([depth_i[keep], depth_j[keep]])),
-        np.concatenate([information[keep], information[keep]]),
-        len(problem.pairs),
-        len(problem.rays),
-    )
-    taken &= np.isfinite(baselines)
-    return _link(problem, directions, np.exp(baselines), np.sqrt(strength), np.flatnonzero(taken))
+    rows = np.concatenate([left[keep], right[keep]])
+    depths = np.log(np.concatenate([depth_i[keep], depth_j[keep]]))
+    edges, information = np.tile(edges[keep], 2), np.tile(information[keep], 2)
+    firmness = np.sqrt(strength)
+    found = []
+    for part in _comparable_parts(edges, rows, len(problem.pairs), len(problem.rays)):
+        baselines = _log_baselines(
+            edges[part], rows[part], depths[part], information[part], len(problem.pairs)
+        )
+        linked = np.flatnonzero(taken & np.isfinite(baselines))
+        found.append(_link(problem, directions, np.exp(baselines), firmness, linked))
+    if not found:
+        return np.full((problem.image_count, 3), np.nan)
+    return join_clusters(replace(problem, directions=directions), found)
+
+
+def _comparable_parts(edges: Array, rows: Array, edge_count: int, row_count: int) -> list[Array]:
+    """Depths, by their places, of edges whose baselines can be compared; the part with most edges first.
+
+    Parameters
+    ----------
+    edges, rows : (S,) edge and ray of each depth. A ray that one edge alone sees compares nothing.
+    """
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    several = np.flatnonzero(np.bincount(rows, minlength=row_count)[rows] > 1)
+    if not len(several):
+        return []
+    ends = (edges[several], edge_count + rows[several])
+    graph = coo_matrix((np.ones(len(several)), ends), shape=(edge_count + row_count,) * 2)
+    labels = connected_components(graph, directed=False)[1]
+    sizes = np.bincount(labels[np.unique(edges[several])])
+    by_label = several[np.argsort(labels[edges[several]], kind="stable")]
+    parts = np.split(by_label, np.flatnonzero(np.diff(labels[edges[by_label]])) + 1)
+    return sorted(parts, key=lambda part: -sizes[labels[edges[part[0]]]])
 
 
 def _strongest(pairs: Array, strength: Array, image_count: int, edges_per_camera: int) -> Array:
@@ -152,32 +182,18 @@ def _strongest(pairs: Array, strength: Array, image_count: int, edges_per_camera
     return np.asarray(taken & (strength > 0))
 
 
-def _log_baselines(
-    edges: Array, rows: Array, log_depths: Array, weights: Array, edge_count: int, row_count: int
-) -> Array:
-    """Logarithms (E) of baselines up to one constant of the largest connected part; NaN elsewhere.
+def _log_baselines(edges: Array, rows: Array, log_depths: Array, weights: Array, edge_count: int) -> Array:
+    """Logarithms (E) of the baselines of edges that can be compared, up to one constant; NaN elsewhere.
 
     A ray row has one depth: log_depth + log_baseline(edge) must agree over the edges that see it. L1 by
     reweighting; the depths are eliminated, so the system is a graph Laplacian over the edges.
     """
-    from scipy.sparse import coo_matrix, csr_matrix, diags
-    from scipy.sparse.csgraph import connected_components
+    from scipy.sparse import csc_matrix, csr_matrix, diags
 
     result = np.full(edge_count, np.nan)
-    seen = np.bincount(rows, minlength=row_count)
-    several = seen[rows] > 1
-    edges, rows, log_depths, weights = edges[several], rows[several], log_depths[several], weights[several]
-    if len(edges) == 0:
-        return result
-    graph = coo_matrix(
-        (np.ones(len(edges)), (edges, edge_count + rows)), shape=(edge_count + row_count,) * 2
-    )
-    labels = connected_components(graph, directed=False)[1]
-    sizes = np.bincount(labels[np.unique(edges)])
-    main = labels[edges] == np.argmax(sizes)
-    names, column = np.unique(edges[main], return_inverse=True)
-    row = np.unique(rows[main], return_inverse=True)[1]
-    values, base = log_depths[main], weights[main]
+    names, column = np.unique(edges, return_inverse=True)
+    row = np.unique(rows, return_inverse=True)[1]
+    values, base = log_depths, weights
     unknown = np.zeros(len(names))
     robust = np.ones(len(values))
     for _ in range(IRLS_ROUNDS):
@@ -190,7 +206,7 @@ def _log_baselines(
         laplacian = diags(np.bincount(column, weights=w)) - incidence.T @ mean_incidence
         mean_value = np.bincount(row, weights=w * values) / per_row
         right = np.bincount(column, weights=w * (mean_value[row] - values))
-        matrix = (laplacian + diags(1e-9 * laplacian.diagonal())).tocsc()
+        matrix = csc_matrix(laplacian + diags(1e-9 * laplacian.diagonal()))
         unknown = _solve(matrix, right[:, None])[:, 0]
         if np.abs(unknown - before).max() < IRLS_TOLERANCE:
             break

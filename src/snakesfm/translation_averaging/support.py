@@ -13,6 +13,8 @@ from snakesfm.translation_averaging.problem import PositioningProblem
 
 Array = NDArray[Any]
 
+TELLING_SIGHTS = 3
+
 
 @dataclass(frozen=True)
 class SupportLimits:
@@ -39,8 +41,14 @@ class SupportLimits:
 def held_cameras(
     problem: PositioningProblem, centers: Array, points: Array, limits: SupportLimits
 ) -> Array:
-    """Mask (N) of the cameras whose centre enough rays, or enough edges, hold in place."""
+    """Mask (N) of the cameras whose centre enough rays, or enough edges, hold in place.
+
+    Rays to landmarks that fewer than two other cameras see tell no more than the edge to these.
+    """
     count = problem.image_count
+    located = np.isfinite(centers[problem.ray_images, 0]) & np.isfinite(points[problem.ray_tracks, 0])
+    sights = np.bincount(problem.ray_tracks[located], minlength=len(points))
+    problem = problem.select_rays(located & (sights[problem.ray_tracks] >= TELLING_SIGHTS))
     angles = angles_rad(problem, centers, points)
     known = np.isfinite(angles)
     # Where the averaged rotations are poor everywhere, one camera must not be better than the rest.

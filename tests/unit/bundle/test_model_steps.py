@@ -107,6 +107,25 @@ def test_filter_drops_observations_and_not_whole_tracks():
     assert np.diff(from_reconstruction(reconstruction, model).offsets).min() == 4
 
 
+def test_images_of_few_long_tracks_keep_their_short_ones():
+    made = problem()
+    lengths = np.diff(made.track_offsets)
+    track_of = np.repeat(np.arange(len(lengths)), lengths)
+    # of the tracks of the first image only two observations stay, one of them its own
+    mine = np.zeros(len(lengths), bool)
+    mine[track_of[made.track_image_ids == 0]] = True
+    place = np.arange(len(track_of)) - made.track_offsets[:-1][track_of]
+    model = model_of(made, keep=~mine[track_of] | (place < 2))
+    counts = []
+    for sparse_observations in (0, 1, 10_000):
+        reconstruction = to_reconstruction(model, made.keypoints, NAMES)
+        drop_short_tracks(reconstruction, 3, sparse_observations)
+        counts.append((reconstruction.image(1).num_points3D, reconstruction.num_points3D()))
+    assert counts[0] == (0, (lengths[~mine] >= 3).sum())
+    assert counts[1] == (mine.sum(), (lengths[~mine] >= 3).sum() + mine.sum())
+    assert counts[2] == (mine.sum(), len(lengths))
+
+
 def test_weak_images_are_taken_out():
     made = problem()
     few = np.ones(len(made.track_image_ids), bool)

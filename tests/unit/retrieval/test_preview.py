@@ -7,7 +7,13 @@ import pytest
 
 from snakesfm.features.keypoints import KeypointSet
 from snakesfm.features.sift import rootsift
-from snakesfm.retrieval.preview import choose_partners, largest_keypoints, likeness, look_at_pairs
+from snakesfm.retrieval.preview import (
+    alike_pairs,
+    choose_partners,
+    largest_keypoints,
+    likeness,
+    look_at_pairs,
+)
 
 
 def histograms(count, seed):
@@ -138,6 +144,16 @@ def test_partners_are_chosen_as_by_hand(enough):
     assert np.flatnonzero(stays).tolist() == partners_by_hand(pairs, likenesses, *enough)
     order = rng.permutation(len(pairs))
     np.testing.assert_array_equal(choose_partners(pairs[order], likenesses[order], *enough), stays[order])
+
+
+def test_an_image_keeps_its_most_alike_partners_however_little_they_resemble_it():
+    pairs = np.array([[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3], [0, 4], [1, 4]])
+    likenesses = np.array([5.0, 0.2, 0.3, 4.0, 0.1, 0.4, np.nan, 0.05], np.float32)
+    # partners in falling order: 0: 1 3 2; 1: 0 2 3 4; 2: 1 3 0; 3: 2 0 1; 4: 1
+    kept = [np.flatnonzero(alike_pairs(pairs, likenesses, 1.5, least)).tolist() for least in (0, 1, 2, 9)]
+    assert kept == [[0, 3, 6], [0, 3, 5, 6, 7], [0, 2, 3, 5, 6, 7], list(range(8))]
+    assert alike_pairs(pairs, likenesses, 0.0, 0).all()
+    assert alike_pairs(pairs[:0], likenesses[:0], 1.5, 3).tolist() == []
 
 
 def test_an_image_of_weak_links_keeps_more_than_enough():

@@ -271,8 +271,10 @@ def test_pairs_are_looked_at_and_what_shares_nothing_is_left(dealt, whole):
     strangers = [likenesses[pair] for pair in likenesses if 4 in pair and not {2, 3} & {*pair}]
     least = min(likenesses[pair] for pair in overlapping)
     assert len(strangers) == 3 and max(strangers) < 1.5 < least
-    left = dealt.select(options.model_copy(update={"min_likeness": 1.5}))
-    assert {pair for pair, *_ in left if not {2, 3} & {*pair}} == overlapping
+    strict = options.model_copy(update={"min_likeness": 1.5, "least_partners": 0})
+    assert {pair for pair, *_ in dealt.select(strict) if not {2, 3} & {*pair}} == overlapping
+    lenient = {pair for pair, *_ in dealt.select(strict.model_copy(update={"least_partners": 1}))}
+    assert len([pair for pair in lenient if 4 in pair and not {2, 3} & {*pair}]) == 1
     fewest = options.model_copy(update={"enough_partners": 1, "enough_likeness": 0.0})
     kept = {pair for pair, *_ in dealt.select(fewest) if not {2, 3} & {*pair}}
     # each of four images keeps one

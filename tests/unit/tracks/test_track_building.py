@@ -46,6 +46,24 @@ def test_short_tracks_are_left_out():
     assert len(as_sets(build_tracks(spread_keypoints(3, 3), *matches_of(table), min_length=2))) == 2
 
 
+def test_images_of_few_long_tracks_keep_their_short_ones():
+    long = [(k, k) for k in range(3)]
+    table = {(0, 1): [*long, (3, 3)], (1, 2): long, (0, 2): long, (2, 3): [(4, 0)], (1, 3): [(5, 1)]}
+    of_three = [[(0, k), (1, k), (2, k)] for k in range(3)]
+
+    def tracks(sparse_observations):
+        return as_sets(
+            build_tracks(
+                spread_keypoints(4, 6), *matches_of(table), sparse_observations=sparse_observations
+            )
+        )
+
+    assert tracks(0) == of_three
+    # the last image is in no track of three, the others are in as many as are asked for
+    assert tracks(3) == [*of_three, [(1, 5), (3, 1)], [(2, 4), (3, 0)]]
+    assert tracks(4) == [*of_three, [(0, 3), (1, 3)], [(1, 5), (3, 1)], [(2, 4), (3, 0)]]
+
+
 def test_no_matches_give_no_tracks():
     tracks = build_tracks(spread_keypoints(2, 3), *matches_of({}))
     assert tracks.offsets.tolist() == [0] and len(tracks.image_ids) == 0

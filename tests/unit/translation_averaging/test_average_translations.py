@@ -11,8 +11,8 @@ from snakesfm.translation_averaging.averagers import ScaleChain, edge_angles_rad
 from snakesfm.translation_averaging.landmarks import cover_cameras, intersect
 from snakesfm.translation_averaging.problem import PositioningProblem, edge_directions, world_rays
 from snakesfm.translation_averaging.recovery import mfas_weights
-from snakesfm.translation_averaging.scale_chain import refine_directions, shared_rays
-from snakesfm.translation_averaging.support import SupportLimits
+from snakesfm.translation_averaging.scale_chain import chain_centers, refine_directions, shared_rays
+from snakesfm.translation_averaging.support import SupportLimits, held_cameras
 
 LIMITS = SupportLimits()
 
@@ -103,6 +103,74 @@ def test_directions_of_outlier_pairs_are_mended_from_rays():
     inliers = ~truth.edge_outliers
     assert np.median(after[inliers]) < 0.8 * np.median(before[inliers])
     assert (after < 3.0).mean() > (before < 3.0).mean() + 0.1
+
+
+def two_clusters(edges_between):
+    """Thirty cameras of which the last ten share no landmark with the others, and some edges between them."""
+    truth = make_problem(30, 3000, "area", noise_px=0.3, rotation_noise_deg=0.05, seed=3)
+    problem = positioning(truth)
+    second = np.arange(30) >= 20
+    across = second[problem.pairs[:, 0]] != second[problem.pairs[:, 1]]
+    kept = ~across
+    kept[np.flatnonzero(across)[edges_between]] = True
+    tracks = 2 * problem.ray_tracks + second[problem.ray_images]
+    order = np.lexsort((problem.ray_images, tracks))
+    apart = dataclasses.replace(
+        problem,
+        ray_images=problem.ray_images[order],
+        ray_tracks=tracks[order],
+        rays=problem.rays[order],
+    )
+    return truth, apart.select_edges(kept), second
+
+
+@pytest.mark.parametrize("averager", ["chain", "whole"])
+def test_clusters_without_common_landmarks_are_joined_by_edges(averager):
+    truth, problem, second = two_clusters(slice(0, 40, 10))
+    if averager == "chain":
+        centers = chain_centers(problem, np.radians(0.45))
+    else:
+        centers = average_translations(problem, ScaleChain(), LIMITS).centers
+    assert np.isfinite(centers).all()
+    extent = np.linalg.norm(np.ptp(truth.centers, axis=0))
+    assert errors(centers, truth.centers).max() < 0.02 * extent
+    # each cluster has its shape from landmarks, so it is what lies between them that may err
+    assert errors(centers[second], truth.centers[second]).max() < 0.005 * extent
+
+
+def test_a_wrong_edge_between_clusters_is_outvoted():
+    truth, problem, second = two_clusters(slice(0, 50, 10))
+    across = np.flatnonzero(second[problem.pairs[:, 0]] != second[problem.pairs[:, 1]])
+    directions = problem.directions.copy()
+    directions[across[0]] = np.roll(directions[across[0]], 1)
+    centers = chain_centers(dataclasses.replace(problem, directions=directions), np.radians(0.45))
+    extent = np.linalg.norm(np.ptp(truth.centers, axis=0))
+    assert np.isfinite(centers).all() and errors(centers, truth.centers).max() < 0.02 * extent
+
+
+@pytest.mark.parametrize("edges_between", [slice(0, 0), slice(0, 1)])
+def test_a_cluster_stays_out_where_edges_do_not_tell_its_scale(edges_between):
+    truth, problem, second = two_clusters(edges_between)
+    centers = chain_centers(problem, np.radians(0.45))
+    assert np.array_equal(np.isfinite(centers[:, 0]), ~second)
+    assert errors(centers, truth.centers).max() < 0.005 * np.linalg.norm(np.ptp(truth.centers, axis=0))
+
+
+def test_a_camera_without_telling_landmarks_is_held_by_its_edges():
+    truth = make_problem(20, 1500, "area", noise_px=0.3, seed=1)
+    problem = positioning(truth)
+    points = truth.points.copy()
+    assert held_cameras(problem, truth.centers, points, LIMITS).all()
+    own = np.unique(problem.ray_tracks[problem.ray_images == 19])
+    points[own] = np.nan
+    assert held_cameras(problem, truth.centers, points, LIMITS)[19]
+    unlinked = problem.select_edges((problem.pairs != 19).all(axis=1))
+    assert not held_cameras(unlinked, truth.centers, points, LIMITS)[19]
+    # landmarks of two cameras are where their rays meet, wherever the cameras are
+    pair = np.isin(problem.ray_images, [18, 19]) | ~np.isin(problem.ray_tracks, own)
+    two = unlinked.select_rays(pair)
+    assert np.count_nonzero(two.ray_images == 19) > LIMITS.min_support
+    assert not held_cameras(two, truth.centers, truth.points, LIMITS)[19]
 
 
 def test_refinement_improves_a_disturbed_start_and_keeps_missing_cameras():
