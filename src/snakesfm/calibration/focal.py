@@ -23,6 +23,8 @@ GIVEN = "given"
 EXIF = "exif"
 ESTIMATED = "estimated"
 CONTRADICTION_SIGMAS = 3.0
+# a default focal length is a worse guess than what a single pair tells
+VOTES_WITHOUT_EXIF = 1
 
 
 @dataclass(frozen=True)
@@ -171,11 +173,8 @@ def _believe(
         focal = float(adjustment.focals[c])
         # distortion and principal point bias all pairs of a camera alike
         sigma = float(np.hypot(adjustment.sigmas[c], options.systematic_sigma))
-        if (
-            adjustment.agreeing[c] < options.min_votes
-            or sigma > options.max_sigma
-            or not low[c] < focal < high[c]
-        ):
+        votes = options.min_votes if from_exif[c] else min(options.min_votes, VOTES_WITHOUT_EXIF)
+        if adjustment.agreeing[c] < votes or sigma > options.max_sigma or not low[c] < focal < high[c]:
             continue
         if from_exif[c]:
             gap = abs(np.log(focal / prior[c]))

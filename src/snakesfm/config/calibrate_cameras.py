@@ -10,7 +10,7 @@ from snakesfm.config.base import StageOptions
 class CalibrateCamerasOptions(StageOptions):
     """How unknown focal lengths are estimated before any pose is known."""
 
-    stage_version: ClassVar[int] = 2
+    stage_version: ClassVar[int] = 3
 
     estimate_focals: bool = True
     """Estimate focal lengths that are not given from fundamental matrices; otherwise priors are kept."""
@@ -22,7 +22,7 @@ class CalibrateCamerasOptions(StageOptions):
     """Pairs with fewer matches do not vote."""
 
     min_votes: int = Field(default=3, ge=1, le=100)
-    """Cameras with fewer usable pairs keep their prior focal length."""
+    """Focal lengths in EXIF stay where fewer pairs vote; without EXIF one vote is enough."""
 
     max_error_px: float = Field(default=1.0, gt=0, le=20)
     """Epipolar error up to which a match supports a fundamental matrix."""
