@@ -124,6 +124,15 @@ def test_exif_is_joined_where_right_and_overruled_where_wrong(exif: float, withi
     assert abs(result.cameras[0].focal_px / 900 - 1) < within
 
 
+def test_one_pair_tells_more_than_a_default_but_not_than_exif() -> None:
+    pairs = [view_pair(301, 900, 900)]
+    guessed = calibrate_focals(pairs, [camera(1200.0)], OPTIONS)
+    assert abs(guessed.cameras[0].focal_px / 900 - 1) < 0.1 and guessed.cameras[0].source == "estimated"
+    assert 0.03 < guessed.sigmas[0] < OPTIONS.max_sigma and guessed.pair_counts.tolist() == [1]
+    exif = calibrate_focals(pairs, [camera(1200.0, "exif")], OPTIONS)
+    assert exif.cameras == [camera(1200.0, "exif")]
+
+
 def test_without_pairs_priors_stay() -> None:
     cameras = [camera(1200.0), camera(800.0, "exif"), camera(900.0, "given")]
     result = calibrate_focals([], cameras, OPTIONS)
