@@ -173,7 +173,7 @@ def _believe(
         focal = float(adjustment.focals[c])
         # distortion and principal point bias all pairs of a camera alike
         sigma = float(np.hypot(adjustment.sigmas[c], options.systematic_sigma))
-        votes = options.min_votes if from_exif[c] else min(options.min_votes, VOTES_WITHOUT_EXIF)
+        votes = options.min_votes if from_exif[c] else VOTES_WITHOUT_EXIF
         if adjustment.agreeing[c] < votes or sigma > options.max_sigma or not low[c] < focal < high[c]:
             continue
         if from_exif[c]:

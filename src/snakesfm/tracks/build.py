@@ -96,11 +96,11 @@ def build_tracks(
     observed = _one_per_image(labels, images, np.bincount(links.ravel(), minlength=len(nodes)))
     labels, parts, images = labels[observed], parts[observed], images[observed]
     rows = nodes[observed] - base[images]
-    long = np.bincount(labels)[labels] >= min_length
+    lengths = np.bincount(labels)[labels]
+    long = lengths >= min_length
     sparse = np.bincount(images[long], minlength=len(keypoints)) < sparse_observations
-    wanted = np.bincount(labels, weights=sparse[images])[labels] > 0
-    several = np.bincount(labels)[labels] >= 2
-    return _assemble(labels, parts, images, rows, long | (wanted & several), conflicts)
+    of_sparse = np.bincount(labels, weights=sparse[images])[labels] > 0
+    return _assemble(labels, parts, images, rows, long | (of_sparse & (lengths >= 2)), conflicts)
 
 
 def _components(links: Array, count: int) -> Array:

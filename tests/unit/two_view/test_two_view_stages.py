@@ -187,18 +187,19 @@ def test_matches_of_unknown_images_are_refused(two_views: Views, tmp_path: Path)
         estimate_two_view.run(pose_job(tmp_path, inputs))
 
 
-@pytest.mark.parametrize("source", ["given", "default"])
-def test_calibration_stage(two_views: Views, tmp_path: Path, source: str) -> None:
+@pytest.mark.parametrize(
+    ("source", "sigma"), [("given", 0.0), ("exif", CalibrateCamerasOptions().exif_sigma)]
+)
+def test_one_pair_leaves_what_is_known(two_views: Views, tmp_path: Path, source: str, sigma: float) -> None:
     inputs = write_inputs(tmp_path, two_views(seed=7), source)
     job = StageJob(
         "calibrate_cameras", "scene", inputs, (tmp_path / "out.h5",), CalibrateCamerasOptions(), seed=5
     )
     calibrate_cameras.run(job)
     found = CalibratedCameras.read(tmp_path / "out.h5")
-    # one pair is too few to vote, so the prior stays
     assert found.sources.tolist() == [source]
     assert found.params[0, 0] == 900.0
-    assert np.isnan(found.focal_sigma[0]) == (source == "default")
+    assert found.focal_sigma.tolist() == [sigma]
 
 
 def test_calibration_stage_estimates(two_views: Views, tmp_path: Path) -> None:
