@@ -94,8 +94,9 @@ def test_what_runs_apart_returns_fails_or_is_stopped():
 
 
 def test_large_memory_is_measured_above_the_start():
-    outcome = run_apart(lambda: np.ones(1 << 23)[:1], 60.0)
-    assert 60.0 < outcome.peak_mib < 100.0
+    # more than a process that ran other tests may have freed and kept
+    outcome = run_apart(lambda: np.ones(1 << 25)[:1], 60.0)
+    assert 240.0 < outcome.peak_mib < 300.0
 
 
 def test_tables_hold_medians_spreads_ratios_and_failures():
