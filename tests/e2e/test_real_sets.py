@@ -6,6 +6,9 @@ from pathlib import Path
 import pytest
 from workflow_runner import Workflow
 
+from benchmarks.compare.sets import read_sets
+from benchmarks.thinned import thin
+
 pytestmark = pytest.mark.e2e
 
 # set, known intrinsics, least AUC at 1, 3 and 5 degrees
@@ -51,25 +54,11 @@ def test_unknown_intrinsics(data: Path, workflow: Workflow, name: str, least: tu
     check(metrics_of(workflow, data / name), least)
 
 
-def every_fourth(folder: Path, target: Path) -> Path:
-    """Every fourth photograph of a set, and their reference without points."""
-    shown = sorted(path.name for path in (folder / "images").iterdir())[::4]
-    (target / "images").mkdir(parents=True)
-    for name in shown:
-        (target / "images" / name).symlink_to(folder / "images" / name)
-    (target / "reference").mkdir()
-    cameras = (folder / "reference" / "cameras.txt").read_text()
-    (target / "reference" / "cameras.txt").write_text(cameras)
-    lines = (folder / "reference" / "images.txt").read_text().split("\n")
-    poses = [line for line in lines if line and line.split()[-1] in shown]
-    (target / "reference" / "images.txt").write_text("".join(f"{line}\n\n" for line in poses))
-    (target / "reference" / "points3D.txt").write_text("")
-    return target
-
-
 def test_photographs_that_overlap_little(data: Path, workflow: Workflow) -> None:
-    folder = every_fourth(data / "strecha_castle_p30", workflow.folder / "sparse")
-    metrics = metrics_of(workflow, folder, f"cameras={folder / 'reference' / 'cameras.txt'}")
+    folder = workflow.folder / "sparse"
+    (images,) = read_sets(data, ["strecha_castle_p30"])
+    assert thin(images, 4, folder) == 8
+    metrics = metrics_of(workflow, folder, f"cameras={folder / 'reference'}")
     # two images share no point with two others of the model, just matches along a loop of pairs
     assert metrics["reference_images_registered"] == metrics["reference_images"] == 8
     assert 50.0 < metrics["relative_pose_auc_1deg"] < 95.0
