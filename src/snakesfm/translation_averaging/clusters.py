@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from snakesfm.translation_averaging.averagers import edge_angles_rad
-from snakesfm.translation_averaging.landmarks import perpendicular
+from snakesfm.translation_averaging.landmarks import perpendicular, usual_error_rad
 from snakesfm.translation_averaging.problem import PositioningProblem
 
 Array = NDArray[Any]
@@ -38,9 +38,7 @@ def join_clusters(problem: PositioningProblem, clusters: Sequence[Array]) -> Arr
     """
     centers = clusters[0].copy()
     waiting = list(clusters[1:])
-    angles = edge_angles_rad(problem, centers)
-    angles = angles[np.isfinite(angles)]
-    sigma_rad = max(LEAST_SIGMA_RAD, 1.5 * float(np.median(angles))) if len(angles) else LEAST_SIGMA_RAD
+    sigma_rad = usual_error_rad(edge_angles_rad(problem, centers), LEAST_SIGMA_RAD)
     before = -1
     while before != len(waiting):
         before = len(waiting)

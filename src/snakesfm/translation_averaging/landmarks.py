@@ -85,3 +85,9 @@ def angles_rad(problem: PositioningProblem, centers: Array, points: Array) -> Ar
     offsets = points[problem.ray_tracks] - centers[problem.ray_images]
     cross = np.linalg.norm(np.cross(offsets, problem.rays), axis=1)
     return np.asarray(np.arctan2(cross, np.einsum("qi,qi->q", offsets, problem.rays)))
+
+
+def usual_error_rad(angles: Array, least_rad: float) -> float:
+    """Standard deviation that residual angles (Q) show, at least ``least_rad``; NaN ones do not count."""
+    angles = angles[np.isfinite(angles)]
+    return max(least_rad, 1.5 * float(np.median(angles))) if len(angles) else least_rad

@@ -8,7 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from snakesfm.translation_averaging.averagers import edge_angles_rad
-from snakesfm.translation_averaging.landmarks import angles_rad, intersect, perpendicular, sum_by
+from snakesfm.translation_averaging.landmarks import (
+    angles_rad,
+    intersect,
+    perpendicular,
+    sum_by,
+    usual_error_rad,
+)
 from snakesfm.translation_averaging.problem import PositioningProblem
 
 Array = NDArray[Any]
@@ -50,11 +56,8 @@ def held_cameras(
     sights = np.bincount(problem.ray_tracks[located], minlength=len(points))
     problem = problem.select_rays(located & (sights[problem.ray_tracks] >= TELLING_SIGHTS))
     angles = angles_rad(problem, centers, points)
-    known = np.isfinite(angles)
     # Where the averaged rotations are poor everywhere, one camera must not be better than the rest.
-    sigma = (
-        max(limits.sigma_rad, 1.5 * float(np.median(angles[known]))) if known.any() else limits.sigma_rad
-    )
+    sigma = usual_error_rad(angles, limits.sigma_rad)
     by_rays = _held(
         problem.ray_images,
         angles < 4.0 * sigma,

@@ -61,8 +61,7 @@ def run_all(inputs, tmp_path, name="model.h5", detector_shorter_side_px=None, **
     side = (
         {} if detector_shorter_side_px is None else {"detector_shorter_side_px": detector_shorter_side_px}
     )
-    sparse = {name: options[name] for name in options if name == "sparse_observations"}
-    run(build_tracks, BuildTracksOptions(**sparse), inputs, inputs["tracks"], **side)
+    run(build_tracks, BuildTracksOptions(), inputs, inputs["tracks"], **side)
     run(triangulate_tracks, TriangulateTracksOptions(), inputs, inputs["points"], **side)
     settings = {"intrinsics": "fixed", "images": str(tmp_path / "images"), **side}
     run(adjust_bundle, AdjustBundleOptions(**options), inputs, tmp_path / name, **settings)
@@ -75,7 +74,9 @@ def test_stages_in_a_row(made, inputs, tmp_path, capsys):
     assert not (tracks.image_ids == 5).any()
     lengths = np.diff(tracks.offsets)
     of_long = np.repeat(lengths >= 3, lengths)
-    sparse = np.bincount(tracks.image_ids[of_long], minlength=COUNT) < 100
+    sparse = (
+        np.bincount(tracks.image_ids[of_long], minlength=COUNT) < BuildTracksOptions().sparse_observations
+    )
     with_sparse = np.add.reduceat(sparse[tracks.image_ids], tracks.offsets[:-1]) > 0
     assert 0 < (lengths == 2).sum() == (with_sparse & (lengths == 2)).sum()
     for row in (0, len(tracks.image_ids) - 1):
