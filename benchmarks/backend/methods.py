@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.backend.problems import Problem
+from snakesfm.config.filter_view_graph import FilterViewGraphOptions
 from snakesfm.rotation_averaging.base import RotationGraph
 from snakesfm.rotation_averaging.linear import apply_increments, solve_anisotropic, world_residuals
 from snakesfm.rotation_averaging.noise import fill_covariances
@@ -22,7 +23,8 @@ from snakesfm.view_graph.filters import (
 
 Array = NDArray[Any]
 
-CYCLE_ERROR_RAD = np.radians(7.0)
+DEFAULTS = FilterViewGraphOptions()
+CYCLE_ERROR_RAD = np.radians(DEFAULTS.max_cycle_error_deg)
 
 
 def snakesfm_rotations(problem: Problem, filtering: str, averaging: str) -> Array:
@@ -33,11 +35,18 @@ def snakesfm_rotations(problem: Problem, filtering: str, averaging: str) -> Arra
         cycles = find_cycles(node_count, pairs, problem.rotations)
     if filtering == "cycles":
         reasons = refuse_by_cycles(len(pairs), cycles, "min", "median", CYCLE_ERROR_RAD)
-    elif filtering == "messages":
+    elif filtering == "messages" and cycles.per_edge >= DEFAULTS.min_cycles_per_edge:
         reasons = refuse_by_messages(len(pairs), cycles, problem.counts, CYCLE_ERROR_RAD)
         confirmed = (reasons == "kept") & np.isfinite(cycles.smallest)
         reasons = vote_between_clusters(
-            node_count, pairs, problem.rotations, problem.counts, reasons, confirmed, 30, np.radians(10.0)
+            node_count,
+            pairs,
+            problem.rotations,
+            problem.counts,
+            reasons,
+            confirmed,
+            DEFAULTS.min_cluster_inliers,
+            np.radians(DEFAULTS.vote_tolerance_deg),
         )
     reasons, _ = keep_largest_component(node_count, pairs, reasons)
     graph = RotationGraph(

@@ -13,6 +13,7 @@ from typing import Any
 
 from snakesfm import slurm
 from snakesfm.errors import ConfigError
+from snakesfm.job_logs import find_cost
 from snakesfm.plan import Plan
 from snakesfm.records import unrecorded_files
 from snakesfm.scene_plan import ScenePlan
@@ -190,7 +191,7 @@ class Run:
             lines = log.read_text("utf-8", errors="replace").splitlines()
             if lines and lines[-1].startswith("error: "):
                 sentences.append(f"{lines[-1].removeprefix('error: ')} (log: {log})")
-            elif lines and " done in " not in lines[-1]:
+            elif lines and not find_cost(lines[-1]):
                 sentences.append(
                     f"{log.parent.name} {log.stem} was ended from outside, for its memory or time, by "
                     f"a person or with its node (log: {log})"

@@ -10,13 +10,16 @@ from snakesfm.config.base import StageOptions
 class FilterViewGraphOptions(StageOptions):
     """Options of refusing edges of the view graph that contradict the others."""
 
-    stage_version: ClassVar[int] = 3
+    stage_version: ClassVar[int] = 4
 
     method: Literal["message_passing", "cycles"] = "message_passing"
     """How 3-cycles refuse edges: by message passing between them, or by the paper's two passes."""
 
     max_cycle_error_deg: float = Field(default=7.0, gt=0, le=180)
     """Edges are refused whose cycle error in degrees is larger than this."""
+
+    min_cycles_per_edge: float = Field(default=6.0, ge=0)
+    """Where edges are in fewer 3-cycles on average, message passing and vote refuse none."""
 
     first_pass: Literal["min", "median", "none"] = "min"
     """Error of an edge in the first pass of method cycles: that of its best or of its median 3-cycle."""

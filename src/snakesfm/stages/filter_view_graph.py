@@ -26,11 +26,15 @@ def run(job: StageJob) -> None:
     edge_count = len(graph.pairs)
     max_error = np.radians(options.max_cycle_error_deg)
     cycles = find_cycles(image_count, graph.pairs, graph.rotations)
+    telling = options.method == "cycles" or cycles.per_edge >= options.min_cycles_per_edge
     if options.method == "cycles":
         reasons = refuse_by_cycles(edge_count, cycles, options.first_pass, options.second_pass, max_error)
-    else:
+    elif telling:
         reasons = refuse_by_messages(edge_count, cycles, graph.inlier_counts, max_error)
-    if options.cluster_vote:
+    else:
+        # few cycles mislead; average_rotations judges every edge by its residual
+        reasons = np.full(edge_count, "kept", dtype=object)
+    if options.cluster_vote and telling:
         reasons = vote_between_clusters(
             image_count,
             graph.pairs,

@@ -37,6 +37,11 @@ class Cycles:
     errors: Array
     smallest: Array
 
+    @property
+    def per_edge(self) -> float:
+        """How many cycles an edge is in on average."""
+        return 3 * len(self.edges) / max(len(self.smallest), 1)
+
 
 def find_cycles(
     node_count: int, pairs: Array, rotations: Array, per_edge: int = PER_EDGE, tried: int = TRIED

@@ -8,6 +8,7 @@ import pytest
 
 from benchmarks.backend.apart import run_apart
 from benchmarks.backend.measures import position_errors_percent, rotation_errors_deg
+from benchmarks.backend.methods import METHODS
 from benchmarks.backend.positions import POSITIONS, pose_positioning
 from benchmarks.backend.problems import LAYOUTS, lay_out
 from benchmarks.backend.report import overview, position_table, render, rotation_table
@@ -79,6 +80,13 @@ def test_rotation_errors_are_blind_to_the_world():
     problem = lay_out("ring", 12, 0.0, 0)
     world = exp_so3(np.array([[1.0, 0.5, -0.2]]))[0]
     assert rotation_errors_deg(problem.truth @ world, problem.truth).max() < 1e-5
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_wrong_edges_of_a_street_do_not_turn_its_cameras(seed):
+    problem = lay_out("street", 50, 0.3, seed)
+    errors = rotation_errors_deg(METHODS["messages + two_stage"](problem), problem.truth)
+    assert 0.1 < np.mean(errors) < 3.0
 
 
 def test_what_runs_apart_returns_fails_or_is_stopped():

@@ -152,6 +152,28 @@ def test_residuals_refuse_what_the_filter_left(scene):
     assert (averaged.labels[~wrong & ~apart] == 0).all()
 
 
+@pytest.mark.parametrize(("least", "reason"), [(0.0, "cycle_message"), (6.0, "kept")])
+def test_few_cycles_refuse_nothing(scene, least, reason):
+    folder, job, _, truth, _ = scene
+    header = job("x", BuildViewGraphOptions(), "x").header
+    # each image with the next three, so an edge is in two cycles or three
+    pairs = np.array([(i, j) for i in range(IMAGES) for j in range(i + 1, min(i + 4, IMAGES))])
+    rotations = truth[pairs[:, 1]] @ truth[pairs[:, 0]].transpose(0, 2, 1)
+    wrong = int(np.flatnonzero((pairs == (5, 7)).all(axis=1))[0])
+    rotations[wrong] = Rotation.from_rotvec([0, 1.0, 0]).as_matrix() @ rotations[wrong]
+    tile = folder / "band.h5"
+    geometries(pairs, rotations, np.zeros(len(pairs), np.int8)).write(tile, header)
+    _, filtered, averaged = run_all(
+        (folder, job, [tile], None, None),
+        FilterViewGraphOptions(min_cycles_per_edge=least),
+        AverageRotationsOptions(),
+    )
+    assert EDGE_LABELS[filtered.labels[wrong]] == reason
+    refused = "rotation_residual" if reason == "kept" else reason
+    assert EDGE_LABELS[averaged.labels[wrong]] == refused
+    assert np.flatnonzero(averaged.labels).tolist() == [wrong]
+
+
 def test_same_run_gives_the_same_bytes(scene):
     folder = scene[0]
     run_all(scene, FilterViewGraphOptions(), AverageRotationsOptions())
