@@ -54,8 +54,9 @@ def run(job: StageJob) -> None:
         cycle_median_deg=np.degrees(median_of(edge_count, cycles, np.ones(edge_count, dtype=bool))),
         components=components,
     ).write(job.output, job.header)
+    sparse = "" if telling else f"; {cycles.per_edge:.1f} 3-cycles per edge are too few to refuse any"
     print(
         f"filter_view_graph: {np.count_nonzero(labels == 0)} of {edge_count} edges kept,"
-        f" {np.count_nonzero(components == 0)} of {image_count} images in the largest component",
+        f" {np.count_nonzero(components == 0)} of {image_count} images in the largest component{sparse}",
         file=sys.stderr,
     )
