@@ -13,18 +13,16 @@ from snakesfm.rotation_averaging.linear import apply_increments, solve_anisotrop
 from snakesfm.rotation_averaging.noise import fill_covariances
 from snakesfm.rotation_averaging.registry import make_averager
 from snakesfm.rotation_averaging.verification import average_view_graph
+from snakesfm.stages.filter_view_graph import refuse_edges
 from snakesfm.view_graph.cycles import find_cycles
-from snakesfm.view_graph.filters import (
-    keep_largest_component,
-    refuse_by_cycles,
-    refuse_by_messages,
-    vote_between_clusters,
-)
+from snakesfm.view_graph.filters import keep_largest_component
 
 Array = NDArray[Any]
 
-DEFAULTS = FilterViewGraphOptions()
-CYCLE_ERROR_RAD = np.radians(DEFAULTS.max_cycle_error_deg)
+FILTERS = {
+    "messages": FilterViewGraphOptions(),
+    "cycles": FilterViewGraphOptions(method="cycles", cluster_vote=False),
+}
 
 
 def snakesfm_rotations(problem: Problem, filtering: str, averaging: str) -> Array:
@@ -33,20 +31,8 @@ def snakesfm_rotations(problem: Problem, filtering: str, averaging: str) -> Arra
     reasons = np.full(len(pairs), "kept", dtype=object)
     if filtering != "none":
         cycles = find_cycles(node_count, pairs, problem.rotations)
-    if filtering == "cycles":
-        reasons = refuse_by_cycles(len(pairs), cycles, "min", "median", CYCLE_ERROR_RAD)
-    elif filtering == "messages" and cycles.per_edge >= DEFAULTS.min_cycles_per_edge:
-        reasons = refuse_by_messages(len(pairs), cycles, problem.counts, CYCLE_ERROR_RAD)
-        confirmed = (reasons == "kept") & np.isfinite(cycles.smallest)
-        reasons = vote_between_clusters(
-            node_count,
-            pairs,
-            problem.rotations,
-            problem.counts,
-            reasons,
-            confirmed,
-            DEFAULTS.min_cluster_inliers,
-            np.radians(DEFAULTS.vote_tolerance_deg),
+        reasons = refuse_edges(
+            node_count, pairs, problem.rotations, problem.counts, cycles, FILTERS[filtering]
         )
     reasons, _ = keep_largest_component(node_count, pairs, reasons)
     graph = RotationGraph(
