@@ -15,7 +15,8 @@ from snakesfm.artifacts import (
 from snakesfm.bundle.completion import correspondence_graph
 from snakesfm.bundle.interface import SolverSettings
 from snakesfm.bundle.model import BundleModel, from_reconstruction, to_reconstruction
-from snakesfm.bundle.rounds import RoundSettings, adjust_rounds
+from snakesfm.bundle.round_settings import RoundSettings
+from snakesfm.bundle.rounds import adjust_rounds
 from snakesfm.geometry.camera import cameras_to_columns
 from snakesfm.view_graph.components import label_components
 

@@ -149,3 +149,10 @@ def reprojection_errors(model: BundleModel, keypoints: Array) -> Array:
             projected = model.cameras[camera].to_pycolmap().img_from_cam(in_camera[rows])
             errors[rows] = np.linalg.norm(np.asarray(projected).reshape(-1, 2) - keypoints[rows], axis=1)
     return errors
+
+
+def mean_point_errors(errors: Array, offsets: Array) -> Array:
+    """Mean (T,) of flat errors (L,) per point."""
+    if len(offsets) == 1:
+        return np.zeros(0)
+    return np.asarray(np.add.reduceat(errors, offsets[:-1]) / np.diff(offsets))

@@ -1,13 +1,12 @@
 """The chained rounds of bundle adjustment."""
 
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass, replace
-from typing import Any, Literal
+from dataclasses import replace
+from typing import Literal
 
 import cv2  # noqa: F401 - must be loaded before pycolmap, whose PNG library clashes otherwise
 import numpy as np
 import pycolmap
-from numpy.typing import NDArray
 
 from snakesfm.bundle.completion import TrackCompleter
 from snakesfm.bundle.filtering import (
@@ -20,15 +19,14 @@ from snakesfm.bundle.filtering import (
     usual_focal_px,
 )
 from snakesfm.bundle.image_sources import ImageSource
-from snakesfm.bundle.interface import BundleAdjuster, Loss, SolverSettings
+from snakesfm.bundle.interface import BundleAdjuster, SolverSettings
 from snakesfm.bundle.keypoint_refinement import refine_keypoints
 from snakesfm.bundle.lenses import find_wider_lenses, set_camera
 from snakesfm.bundle.principal_points import find_told_cameras
 from snakesfm.bundle.registration import left_out_images, register_left_out
+from snakesfm.bundle.round_settings import RoundRecord, RoundSettings
 from snakesfm.bundle.selection import adjust_selection
 from snakesfm.geometry.camera import Camera
-
-Array = NDArray[Any]
 
 EARLY_TOLERANCE = 300.0
 # of the longest plausible focal length: the rays of such a lens are all but parallel
@@ -41,57 +39,6 @@ CHEAP_STEPS = 2_000_000
 MOST_STEPS = 500
 # of exact keypoints the model shows no noise but that of float32 and of the solver
 EXACT_PX = 0.05
-
-
-@dataclass(frozen=True)
-class RoundSettings:
-    """What is done in and between the rounds; see the options of adjust_bundle for each."""
-
-    solver: Literal["ceres", "gtsam"] = "ceres"
-    thresholds_px: tuple[float, ...] = (10.0, 5.0, 3.0)
-    rotations_first: bool = False
-    loss_scale_px: float | Literal["auto"] = "auto"
-    loss_scale_sigmas: float = 3.5
-    early_loss_share: float = 0.4
-    last_loss: Loss = "huber"
-    outlier_sigmas: float = 12.0
-    distortion_from_round: int = 2
-    widen_lenses: bool = False
-    refine_principal_points: bool = True
-    max_principal_point_gap: float = 0.003
-    min_principal_point_offset: float = 0.004
-    max_principal_point_offset: float = 0.02
-    max_focal_change: float = 3.0
-    max_guessed_focal_change: float = 15.0
-    max_distortion: float = 1.0
-    complete_tracks: bool = True
-    complete_error_px: float = 4.0
-    register_images: bool = True
-    register_min_inliers: int = 15
-    register_min_ratio: float = 0.25
-    register_error_px: float = 6.0
-    min_angle_deg: float = 1.0
-    min_track_length: int = 3
-    sparse_observations: int = 100
-    min_observations: int = 10
-    select_above_images: int = 500
-    early_observations: int = 300
-    final_observations: int = 0
-    patient: bool = False
-    seed: int = 0
-
-
-@dataclass(frozen=True)
-class RoundRecord:
-    """What one round did: robust costs before and after, and the model's size and mean error after it.
-
-    Where nothing was adjusted, the costs are that of the pass before.
-    """
-
-    name: str
-    costs: tuple[float, float]
-    counts: tuple[int, int, int]
-    error_px: float
 
 
 def bundle_adjuster(solver: Literal["ceres", "gtsam"]) -> BundleAdjuster:
@@ -416,10 +363,3 @@ def keypoint_noise_px(reconstruction: pycolmap.Reconstruction) -> float:
     if not len(errors):
         return 1.0
     return float(np.median(errors / np.sqrt(np.pi / 2 * (1 - 1.5 / lengths))))
-
-
-def mean_point_errors(errors: Array, offsets: Array) -> Array:
-    """Mean (T,) of flat errors (L,) per point."""
-    if len(offsets) == 1:
-        return np.zeros(0)
-    return np.asarray(np.add.reduceat(errors, offsets[:-1]) / np.diff(offsets))

@@ -40,6 +40,20 @@ def reduce_keypoints(keypoints: Array, scale: float) -> Array:
     return keypoints if scale == 1.0 else keypoints / keypoints.dtype.type(scale)
 
 
+def reduce_all_keypoints(
+    keypoints: Sequence[Array], sizes: Array, settings: Mapping[str, Any]
+) -> list[Array]:
+    """Keypoints (K,2) of each image from original pixels to the detector pixels of a job's settings.
+
+    Parameters
+    ----------
+    keypoints : of N images.
+    sizes, settings : as for :func:`detector_scales`.
+    """
+    scales = detector_scales(sizes, settings).tolist()
+    return [reduce_keypoints(found, scale) for found, scale in zip(keypoints, scales, strict=True)]
+
+
 def reduce_cameras(cameras: Sequence[Camera], settings: Mapping[str, Any]) -> list[Camera]:
     """Cameras from original pixels to the detector pixels of a job's settings."""
     scales = _camera_scales(cameras, settings)

@@ -20,23 +20,20 @@ from snakesfm.bundle.keypoint_refinement import most_share_a_camera
 from snakesfm.bundle.model import (
     BundleModel,
     from_reconstruction,
+    mean_point_errors,
     reprojection_errors,
     to_reconstruction,
 )
 from snakesfm.bundle.models import join_models, restrict_to
 from snakesfm.bundle.reading import observed_keypoints
-from snakesfm.bundle.rounds import (
-    RoundRecord,
-    RoundSettings,
-    adjust_rounds,
-    mean_point_errors,
-)
+from snakesfm.bundle.round_settings import RoundRecord, RoundSettings
+from snakesfm.bundle.rounds import adjust_rounds
 from snakesfm.errors import SceneError
 from snakesfm.geometry.camera import cameras_from_columns, cameras_to_columns
 from snakesfm.geometry.detector_pixels import (
     detector_scales,
+    reduce_all_keypoints,
     reduce_cameras,
-    reduce_keypoints,
     restore_cameras,
 )
 from snakesfm.geometry.poses import translation_of
@@ -172,8 +169,7 @@ def _start(job: StageJob, index: ImageIndex, poses: BundleModel) -> pycolmap.Rec
     """The poses with the triangulated points that they see; it alone stays in memory."""
     start = TriangulatedPoints.read(job.path("points"))
     (keypoints,) = gather_image_columns(job.paths("features"), len(index.names), "keypoints")
-    scales = detector_scales(index.sizes, job.settings).tolist()
-    reduced = [reduce_keypoints(found, scale) for found, scale in zip(keypoints, scales, strict=True)]
+    reduced = reduce_all_keypoints(keypoints, index.sizes, job.settings)
     model = replace(
         poses,
         points=start.points,

@@ -126,7 +126,9 @@ def _averager(options: "AverageTranslationsOptions") -> TranslationAverager:
         return GlobalPositioning(
             options.rays_per_camera, options.positioning_loss_scale, options.positioning_start
         )
-    return ScaleChain(options.rays_per_camera, float(np.radians(options.ray_sigma_deg)))
+    return ScaleChain(
+        options.rays_per_camera, float(np.radians(options.ray_sigma_deg)), options.max_relative_sigma
+    )
 
 
 def _median(values: Array) -> float:

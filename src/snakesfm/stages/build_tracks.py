@@ -12,7 +12,7 @@ from snakesfm.artifacts.images import ImageIndex
 from snakesfm.artifacts.mapping import CameraRotations, TrackTable
 from snakesfm.artifacts.pairs import PairCoordinates, ViewGraph
 from snakesfm.errors import SceneError
-from snakesfm.geometry.detector_pixels import detector_scales, reduce_keypoints
+from snakesfm.geometry.detector_pixels import reduce_all_keypoints
 from snakesfm.stages.job import StageJob
 from snakesfm.tracks.build import build_tracks
 from snakesfm.tracks.merged import compare_track_lengths, describe_lengths
@@ -38,9 +38,8 @@ def run(job: StageJob) -> None:
     kept = (graph.labels == 0) & (rotations.labels == 0) & registered[graph.pairs].all(axis=1)
     keypoints, colors = gather_image_columns(job.paths("features"), len(index.names), "keypoints", "colors")
     pairs, offsets, matches = gather_inlier_matches(job.paths("geometries"), graph.pairs[kept])
-    scales = detector_scales(index.sizes, job.settings).tolist()
     tracks = build_tracks(
-        [reduce_keypoints(found, scale) for found, scale in zip(keypoints, scales, strict=True)],
+        reduce_all_keypoints(keypoints, index.sizes, job.settings),
         pairs,
         offsets,
         matches,

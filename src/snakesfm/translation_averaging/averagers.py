@@ -33,12 +33,14 @@ class ScaleChain:
 
     rays_per_camera: int = 100
     sigma_rad: float = math.radians(0.3)
+    max_relative_sigma: float = 0.1
 
     def position(self, problem: PositioningProblem, seed: int) -> Array:
         """See :class:`TranslationAverager`."""
         from snakesfm.translation_averaging.scale_chain import chain_centers
 
-        centers = chain_centers(with_rays(problem, self.rays_per_camera), 1.5 * self.sigma_rad)
+        rays = with_rays(problem, self.rays_per_camera)
+        centers = chain_centers(rays, 1.5 * self.sigma_rad, self.max_relative_sigma)
         if 2 * np.isfinite(centers[:, 0]).sum() < len(problem.images()):
             return TranslationRecovery().position(problem, seed)
         return centers

@@ -23,18 +23,20 @@ Array = NDArray[Any]
 LEAST_SIGMA_RAD = math.radians(0.3)
 ROUNDS = 10
 AGREEING_SIGMAS = 4.0
-# of a centre, over the distance to the neighbours that tell it
-MAX_RELATIVE_SIGMA = 0.1
 LARGEST_CONDITION = 1e14
 
 
-def join_clusters(problem: PositioningProblem, clusters: Sequence[Array]) -> Array:
+def join_clusters(
+    problem: PositioningProblem, clusters: Sequence[Array], max_relative_sigma: float
+) -> Array:
     """Centres (N,3) of the first cluster and of all that shared cameras and edges tie to it.
 
     Parameters
     ----------
     problem : its edges take part.
     clusters : (N,3) centres of each, in a scale and an origin of its own; NaN outside of the cluster.
+    max_relative_sigma : standard deviation of a centre, over the distance to the neighbours that tell it,
+        up to which a cluster is joined.
     """
     centers = clusters[0].copy()
     waiting = list(clusters[1:])
@@ -44,7 +46,7 @@ def join_clusters(problem: PositioningProblem, clusters: Sequence[Array]) -> Arr
         before = len(waiting)
         left = []
         for cluster in waiting:
-            placed = _place(problem, centers, cluster, sigma_rad)
+            placed = _place(problem, centers, cluster, sigma_rad, max_relative_sigma)
             if placed is None:
                 left.append(cluster)
             else:
@@ -117,7 +119,13 @@ class _Ties:
         return solution, np.linalg.inv(information), agree, float(np.median(reach))
 
 
-def _place(problem: PositioningProblem, centers: Array, cluster: Array, sigma_rad: float) -> Array | None:
+def _place(
+    problem: PositioningProblem,
+    centers: Array,
+    cluster: Array,
+    sigma_rad: float,
+    max_relative_sigma: float,
+) -> Array | None:
     """A cluster scaled and shifted to the known centres, or None where these do not tell how."""
     fresh = cluster[np.isfinite(cluster[:, 0]) & ~np.isfinite(centers[:, 0])]
     ties = _Ties.of(problem, centers, cluster)
@@ -130,6 +138,6 @@ def _place(problem: PositioningProblem, centers: Array, cluster: Array, sigma_ra
     moves = np.concatenate([fresh[:, :, None], np.broadcast_to(np.eye(3), (len(fresh), 3, 3))], axis=2)
     sigmas = np.sqrt(np.linalg.eigvalsh(moves @ covariance @ moves.transpose(0, 2, 1))[:, 2])
     firm = solution[0] > 0 and 2 * np.count_nonzero(agree) >= len(agree)
-    if not firm or (sigmas > MAX_RELATIVE_SIGMA * usual).any():
+    if not firm or (sigmas > max_relative_sigma * usual).any():
         return None
     return np.asarray(solution[0] * cluster + solution[1:])

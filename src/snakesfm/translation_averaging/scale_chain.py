@@ -104,7 +104,12 @@ def epipolar_rad(
     return np.asarray(np.arcsin(np.minimum(volume / np.maximum(plane, 1e-9), 1.0)))
 
 
-def chain_centers(problem: PositioningProblem, scale_rad: float, edges_per_camera: int = 8) -> Array:
+def chain_centers(
+    problem: PositioningProblem,
+    scale_rad: float,
+    max_relative_sigma: float = 0.1,
+    edges_per_camera: int = 8,
+) -> Array:
     """Centres (N,3) from the baselines of the edges; NaN where an image hangs on no edge that has one.
 
     Parts whose baselines no landmark compares with those of the largest are joined to it by their edges.
@@ -113,6 +118,7 @@ def chain_centers(problem: PositioningProblem, scale_rad: float, edges_per_camer
     ----------
     problem : with rays.
     scale_rad : angle at which a ray is held to be half wrong.
+    max_relative_sigma : of the centres of a part that edges join, see :func:`join_clusters`.
     edges_per_camera : the best edges of each camera, by parallax of the rays that agree, take part.
     """
     edges, left, right = shared_rays(problem)
@@ -145,7 +151,7 @@ def chain_centers(problem: PositioningProblem, scale_rad: float, edges_per_camer
         found.append(_link(problem, directions, np.exp(baselines), firmness, linked))
     if not found:
         return np.full((problem.image_count, 3), np.nan)
-    return join_clusters(replace(problem, directions=directions), found)
+    return join_clusters(replace(problem, directions=directions), found, max_relative_sigma)
 
 
 def _comparable_parts(edges: Array, rows: Array, edge_count: int, row_count: int) -> list[Array]:

@@ -12,14 +12,14 @@ Array = NDArray[Any]
 CHUNK = 1 << 19
 """Candidate cycles that are held in memory at once."""
 
-PER_EDGE = 64
+TRIED_PER_EDGE = 64
 """Third images that are tried per edge: all of them where one end has no more neighbours."""
 
-FEWEST_PER_EDGE = 8
+FEWEST_TRIED_PER_EDGE = 8
 """The same in large dense graphs."""
 
 TRIED = 1 << 20
-"""Candidates up to which ``PER_EDGE`` are tried."""
+"""Candidates up to which ``TRIED_PER_EDGE`` are tried."""
 
 
 @dataclass(frozen=True)
@@ -44,13 +44,17 @@ class Cycles:
 
 
 def find_cycles(
-    node_count: int, pairs: Array, rotations: Array, per_edge: int = PER_EDGE, tried: int = TRIED
+    node_count: int,
+    pairs: Array,
+    rotations: Array,
+    tried_per_edge: int = TRIED_PER_EDGE,
+    tried: int = TRIED,
 ) -> Cycles:
     """Find the 3-cycles of a graph, or enough of them where it is dense.
 
     Every edge looks for cycles among the neighbours of its end of smaller degree: all of them up to
-    ``per_edge``, else as many, drawn evenly and depending on the edge alone. A graph with more edges than
-    fit ``tried`` candidates makes do with fewer per edge, so time is about linear in the edges.
+    ``tried_per_edge``, else as many, drawn evenly and depending on the edge alone. A graph with more
+    edges than fit ``tried`` candidates makes do with fewer per edge, so time is about linear in the edges.
 
     Parameters
     ----------
@@ -61,7 +65,9 @@ def find_cycles(
     pairs = np.asarray(pairs, dtype=np.int64).reshape(-1, 2)
     rotations = np.asarray(rotations, dtype=np.float64).reshape(-1, 3, 3)
     edge_count = len(pairs)
-    sample = int(np.clip(tried // max(edge_count, 1), min(FEWEST_PER_EDGE, per_edge), per_edge))
+    sample = int(
+        np.clip(tried // max(edge_count, 1), min(FEWEST_TRIED_PER_EDGE, tried_per_edge), tried_per_edge)
+    )
     keys = [np.zeros(0, dtype=np.int64)]
     for found in _candidates(node_count, pairs, sample):
         keys.append(found)

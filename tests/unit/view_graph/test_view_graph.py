@@ -91,8 +91,8 @@ def test_cycles_agree_with_brute_force(monkeypatch, chunk):
 def test_sampled_cycles_are_real_and_bounded():
     pairs, rotations, _ = noisy_graph(80, 1.0, 2)
     full, sampled = (
-        find_cycles(80, pairs, rotations, per_edge=80),
-        find_cycles(80, pairs, rotations, per_edge=8),
+        find_cycles(80, pairs, rotations, tried_per_edge=80),
+        find_cycles(80, pairs, rotations, tried_per_edge=8),
     )
     assert len(full.edges) == 80 * 79 * 78 // 6
     assert 4 * len(pairs) < len(sampled.edges) <= 8 * len(pairs)
