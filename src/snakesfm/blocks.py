@@ -1,4 +1,7 @@
-"""How many blocks the images are dealt into, and the tiles of pairs that these make."""
+"""How many blocks the images are dealt into, which is whose, and the tiles of pairs that these make."""
+
+import hashlib
+from collections.abc import Sequence
 
 # images up to which so many blocks are used: few steps, so that adding images rarely re-deals them, and so
 # few blocks that a tile takes about half a minute at the upper end of a step (docs/cluster.md)
@@ -12,6 +15,34 @@ def choose_blocks(image_count: int) -> int:
         if image_count <= most_images:
             return blocks
     return MOST_BLOCKS
+
+
+def deal_blocks(names: Sequence[str], blocks: int) -> list[int]:
+    """The block of each image, in 0 .. blocks-1: all of one size, and other images hardly change it.
+
+    A hash of the name chooses the block, and another one where that is full; who comes too late for a full
+    block is told by a hash, too (Mirrokni, Thorup and Zadimoghaddam, "Consistent hashing with bounded
+    loads", SODA 2018). So each image that is added moves few others.
+
+    Parameters
+    ----------
+    names : relative names of all images.
+    blocks : how many blocks there are.
+    """
+    most = -(-len(names) // blocks)
+    sizes = [0] * blocks
+    chosen = [0] * len(names)
+    for row in sorted(range(len(names)), key=lambda row: _hash(names[row], "turn")):
+        choice = 0
+        while sizes[block := _hash(names[row], str(choice)) % blocks] == most:
+            choice += 1
+        sizes[block] += 1
+        chosen[row] = block
+    return chosen
+
+
+def _hash(name: str, use: str) -> int:
+    return int.from_bytes(hashlib.sha256(f"{use}\0{name}".encode()).digest()[:8], "big")
 
 
 def tile_names(blocks: int) -> list[str]:

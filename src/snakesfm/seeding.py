@@ -13,8 +13,3 @@ def derive_seed(seed: int, *names: str) -> int:
     """
     text = "\0".join((str(seed), *names))
     return int.from_bytes(hashlib.sha256(text.encode()).digest()[:4], "big") >> 1
-
-
-def block_of(name: str, blocks: int) -> int:
-    """The block of an image: a stable hash of its relative name, in 0 .. blocks-1."""
-    return int.from_bytes(hashlib.sha256(name.encode()).digest()[8:16], "big") % blocks

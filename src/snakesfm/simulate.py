@@ -20,13 +20,13 @@ from snakesfm.artifacts.base import Header, atomic_path
 from snakesfm.artifacts.features import LocalFeatures
 from snakesfm.artifacts.images import CalibratedCameras, ImageIndex
 from snakesfm.artifacts.pairs import REJECTIONS, ImagePairs, PairMatches, TwoViewGeometries
-from snakesfm.blocks import choose_blocks, tile_names
+from snakesfm.blocks import choose_blocks, deal_blocks, tile_names
 from snakesfm.config.configuration import options_class
 from snakesfm.config.select_pairs import SelectPairsOptions
 from snakesfm.errors import ConfigError, SnakesfmError
 from snakesfm.geometry.camera import Camera, cameras_to_columns
 from snakesfm.geometry.poses import translation_of
-from snakesfm.seeding import block_of, derive_seed
+from snakesfm.seeding import derive_seed
 from snakesfm.synthetic.pairing import candidate_pairs, choose_partners, simulate_edge
 from snakesfm.synthetic.sightings import DetectorModel, DistinctLooks, match_looks, sight
 from snakesfm.synthetic.surveys import SURVEYS, Survey
@@ -87,7 +87,7 @@ class Simulation:
         self.survey: Survey = SURVEYS[options.survey](options.images, options.seed)
         self.model = DetectorModel(max_keypoints=options.keypoints)
         self.blocks = options.blocks or choose_blocks(options.images)
-        self.block_of = np.array([block_of(name, self.blocks) for name in self.survey.names])
+        self.block_of = np.array(deal_blocks(self.survey.names, self.blocks))
 
     def run(self) -> None:
         """Make all artifacts up to the stage ``until``."""

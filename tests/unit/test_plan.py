@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from snakesfm.blocks import choose_blocks, tile_names
+from snakesfm.blocks import choose_blocks, deal_blocks, tile_names
 from snakesfm.errors import ConfigError
 from snakesfm.plan import Plan
-from snakesfm.seeding import block_of, derive_seed
+from snakesfm.seeding import derive_seed
 
 
 def make_images(folder: Path, count: int) -> Path:
@@ -37,17 +37,29 @@ def test_more_images_never_get_fewer_blocks(first: int, second: int) -> None:
     assert 2 <= choose_blocks(low) <= choose_blocks(high) <= 48
 
 
-@given(st.text(min_size=1), st.integers(1, 64))
-def test_a_block_depends_on_the_name_alone(name: str, blocks: int) -> None:
-    assert 0 <= block_of(name, blocks) < blocks
-    assert block_of(name, blocks) == block_of(name, blocks)
+@given(st.sets(st.text(min_size=1), max_size=60), st.integers(1, 64))
+def test_no_block_is_larger_than_it_must_be(names: set[str], blocks: int) -> None:
+    dealt = deal_blocks(sorted(names), blocks)
+    assert len(dealt) == len(names)
+    assert set(dealt) <= set(range(blocks))
+    assert max((dealt.count(block) for block in dealt), default=0) <= -(-len(names) // blocks)
 
 
-def test_blocks_are_of_like_size() -> None:
-    counts = [0] * 8
-    for number in range(4000):
-        counts[block_of(f"DSC_{number:05d}.JPG", 8)] += 1
-    assert 400 < min(counts) <= max(counts) < 600
+def test_the_order_of_images_does_not_matter() -> None:
+    names = [f"DSC_{number:05d}.JPG" for number in range(100)]
+    forwards = dict(zip(names, deal_blocks(names, 7), strict=True))
+    assert forwards == dict(zip(names[::-1], deal_blocks(names[::-1], 7), strict=True))
+
+
+@pytest.mark.parametrize("added", [1, 10])
+@pytest.mark.parametrize(("count", "blocks"), [(50, 2), (200, 4), (2000, 8)])
+def test_more_images_move_few_others(count: int, blocks: int, added: int) -> None:
+    names = [f"DSC_{number:05d}.JPG" for number in range(count)]
+    before = deal_blocks(names, blocks)
+    after = deal_blocks([*names, *(f"new/{number}.JPG" for number in range(added))], blocks)
+    moved = sum(one != other for one, other in zip(before, after, strict=False))
+    assert moved <= blocks * added
+    assert len(set(before)) == len(set(after)) == blocks
 
 
 def test_seeds_differ_by_what_they_are_for_and_fit_31_bits() -> None:

@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from snakesfm.artifacts.images import ImageIndex
+from snakesfm.blocks import deal_blocks
 from snakesfm.errors import ImageError, SceneError
 from snakesfm.geometry.camera import cameras_to_columns
 from snakesfm.ingest.cameras import ImageCameras, Photograph, assign_cameras
 from snakesfm.ingest.discover import digest_images, fingerprint, list_photographs
 from snakesfm.ingest.known import match_known_cameras, read_known_cameras
 from snakesfm.ingest.read import read_header
-from snakesfm.seeding import block_of
 from snakesfm.stages.job import StageJob
 
 if TYPE_CHECKING:
@@ -114,7 +114,7 @@ def _to_index(
         names=np.array([p.name for p in photographs], dtype=object),
         sizes=np.array([(p.width, p.height) for p in photographs], np.int32),
         sha256=np.array(digests, dtype=object),
-        blocks=np.array([block_of(p.name, job.settings["blocks"]) for p in photographs], np.int32),
+        blocks=np.array(deal_blocks([p.name for p in photographs], job.settings["blocks"]), np.int32),
         camera_ids=found.camera_ids,
         orientations=np.array([p.exif.orientation for p in photographs], np.int32),
         focal_exif_px=found.focal_exif_px,

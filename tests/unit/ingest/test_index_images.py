@@ -4,10 +4,10 @@ from PIL import ExifTags, Image
 from PIL.TiffImagePlugin import IFDRational
 
 from snakesfm.artifacts.images import ImageIndex
+from snakesfm.blocks import deal_blocks
 from snakesfm.config.index_images import IndexImagesOptions
 from snakesfm.errors import SceneError
 from snakesfm.ingest.discover import digest_images
-from snakesfm.seeding import block_of
 from snakesfm.stages.index_images import run
 from snakesfm.stages.job import StageJob
 
@@ -57,7 +57,7 @@ def test_index_of_a_mixed_folder(tmp_path, folder, capsys):
     assert found.sizes.tolist() == [[96, 64]] * 5
     assert found.orientations.tolist() == [6, 6, 1, 1, 1]
     assert found.duplicate_of.tolist() == [-1, -1, -1, -1, 2]
-    assert found.blocks.tolist() == [block_of(name, 3) for name in found.names]
+    assert found.blocks.tolist() == deal_blocks(found.names.tolist(), 3)
     assert found.sha256.tolist() == list(digest_images(folder, found.names.tolist()).values())
     assert found.camera_ids.tolist() == [0, 0, 1, 2, 2]
     assert found.camera_sources.tolist() == ["exif", "default", "default"]

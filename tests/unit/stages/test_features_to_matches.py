@@ -15,13 +15,13 @@ from snakesfm.artifacts import (
     PairMatches,
     Vocabulary,
 )
+from snakesfm.blocks import deal_blocks
 from snakesfm.config.describe_images import DescribeImagesOptions
 from snakesfm.config.extract_features import ExtractFeaturesOptions
 from snakesfm.config.learn_vocabulary import LearnVocabularyOptions
 from snakesfm.config.match_pairs import MatchPairsOptions
 from snakesfm.config.select_pairs import SelectPairsOptions
 from snakesfm.errors import ConfigError
-from snakesfm.seeding import block_of
 from snakesfm.stages import describe_images, extract_features, learn_vocabulary, match_pairs, select_pairs
 from snakesfm.stages.job import StageJob
 
@@ -71,7 +71,7 @@ class Scene:
             names=NAMES,
             sizes=np.tile([320, 240], (count, 1)),
             sha256=shas or [f"sha of {name}" for name in NAMES],
-            blocks=[block_of(name, blocks) for name in NAMES],
+            blocks=deal_blocks(NAMES, blocks),
             camera_ids=np.zeros(count, int),
             orientations=np.ones(count, int),
             focal_exif_px=np.full(count, np.nan),
@@ -368,7 +368,7 @@ def test_other_options_or_a_damaged_former_file_take_nothing_over(dealt, images,
 
 def test_an_empty_scene_gives_valid_files(tmp_path, images):
     scene = Scene(tmp_path, images, 40)
-    empty = next(block for block in range(40) if block not in {block_of(name, 40) for name in NAMES})
+    empty = next(block for block in range(40) if block not in deal_blocks(NAMES, 40))
     inputs = {"index": scene.file("index")}
     output = scene.block_files("features")[empty]
     extract_features.run(
