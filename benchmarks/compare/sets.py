@@ -46,26 +46,27 @@ class ImageSet:
     def camera_groups(self) -> list[dict[str, Any]]:
         """What COLMAP is told of the cameras: each group's images, mode and known intrinsics.
 
-        Unknown intrinsics: one camera or one per image, as in the reference.
+        Unknown intrinsics: images share a camera as in the reference; what it lacks has one of its own.
         """
         model = read_model(self.reference)
-        if not self.known:
-            single = len(model.cameras) == 1
-            return [{"names": [], "mode": "SINGLE" if single else "PER_IMAGE"}]
+        if not self.known and len(model.cameras) == len(model.images):
+            return [{"names": [], "mode": "PER_IMAGE"}]
+        if not self.known and len(model.cameras) == 1:
+            return [{"names": [], "mode": "SINGLE"}]
         members = defaultdict(list)
         for image in model.images.values():
             members[image.camera_id].append(image.name)
         groups = []
         for key in sorted(members):
             camera = model.cameras[key]
-            groups.append(
-                {
-                    "names": sorted(members[key]) if len(members) > 1 else [],
-                    "mode": "SINGLE",
-                    "model": camera.model_name,
-                    "params": camera.params.tolist(),
-                }
-            )
+            names = sorted(members[key]) if len(members) > 1 else []
+            group: dict[str, Any] = {"names": names, "mode": "SINGLE"}
+            if self.known:
+                group |= {"model": camera.model_name, "params": camera.params.tolist()}
+            groups.append(group)
+        others = sorted(set(self.image_names()) - {image.name for image in model.images.values()})
+        if others and len(members) > 1:
+            groups.append({"names": others, "mode": "PER_IMAGE"})
         return groups
 
     def pinhole(self) -> list[list[float]] | None:

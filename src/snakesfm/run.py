@@ -155,6 +155,8 @@ class Run:
         self._note("")
         for scene in self.plan.scenes.values():
             print(self.describe(scene), flush=True)
+            if self._is_outdated(scene):
+                continue
             for warning in self._summary(scene).get("warnings", ()):
                 print(f"snakesfm: scene '{scene.name}': warning: {warning}", flush=True)
 
@@ -208,13 +210,24 @@ class Run:
             return {}
         return summary
 
+    def _is_outdated(self, scene: ScenePlan) -> bool:
+        """Whether the images were indexed anew since the model was made, as without the target 'all'."""
+        with contextlib.suppress(OSError):
+            index, summary = (
+                (scene.folder / name).stat().st_mtime_ns
+                for name in ("index_images/index.h5", "export_model/summary.json")
+            )
+            return summary < index
+        return False
+
     def describe(self, scene: ScenePlan) -> str:
         """How many images are registered, the points, the error, the time, and where the model is."""
         summary = self._summary(scene)
-        if not summary:
+        if not summary or self._is_outdated(scene):
             database = Path(scene.database_file())
             made = f"COLMAP database in {database}, " if database.is_file() else ""
-            return f"snakesfm: scene '{scene.name}': {made}no model yet."
+            model = "the model is of former images: 'all' makes it anew" if summary else "no model yet"
+            return f"snakesfm: scene '{scene.name}': {made}{model}."
         others = summary.get("images_in_other_models", [])
         more = f" and {sum(others)} in {len(others)} models beside" if others else ""
         accuracy = ""

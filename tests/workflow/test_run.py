@@ -1,6 +1,7 @@
 """Whole runs on a small rendered scene: results, resuming, re-running, killing."""
 
 import contextlib
+import dataclasses
 import json
 import os
 import re
@@ -287,6 +288,28 @@ def test_the_database_is_made_by_its_own_target_alone(finished, small_scene: Pat
     assert database.num_images() == database.num_frames() == 16
     assert database.num_verified_image_pairs() > 30
     database.close()
+
+
+def test_a_model_of_former_images_is_not_called_this_run_s(finished, small_scene: Path, workflow) -> None:
+    copy_run(finished[0], workflow.folder)
+    scene = workflow.folder / "square"
+    shutil.copytree(small_scene, scene)
+    sorted((scene / "images").iterdir())[0].unlink()
+    outcome = workflow.run("databases", *config_of(scene))
+    assert outcome.status == 0
+    *_, line = outcome.summary
+    assert "COLMAP database in out/square/export_database/database.db" in line
+    assert "the model is of former images" in line
+    assert "registered" not in line
+
+
+def test_the_output_may_be_the_folder_one_is_in(small_scene: Path, workflow) -> None:
+    scene = workflow.folder / "square"
+    shutil.copytree(small_scene, scene)
+    inside = dataclasses.replace(workflow, folder=scene)
+    outcome = inside.run("--dry-run", "--config", "images=images", "output=.")
+    assert outcome.status == 0, outcome.text
+    assert "adjust_bundle" in outcome.rules
 
 
 def test_logs_say_what_the_jobs_cost(finished) -> None:

@@ -11,6 +11,7 @@ from snakemake.settings.types import DeploymentMethod, Quietness
 from snakesfm import resources, slurm
 from snakesfm.errors import SnakesfmError
 from snakesfm.blocks import tile_names
+from snakesfm.config.configuration import check_spelling
 from snakesfm.job_server import JobServer
 from snakesfm.plan import Plan
 from snakesfm.records import makes_nothing
@@ -27,6 +28,7 @@ def refusal(error):
 try:
     # Snakemake knows its targets only later, and this one needs no images
     asked = {argument.split(":")[0] for argument in sys.argv[1:]}
+    check_spelling(config, sys.argv[1:])
     PLAN = Plan(config, weights_only="fetch_weights" in asked)
     RUN = Run(PLAN)
     if workflow.is_main_process and not makes_nothing(sys.argv[1:]):
@@ -54,17 +56,14 @@ wildcard_constraints:
     tile=r"\d+-\d+",
 
 
-OUTPUT = str(PLAN.output)
-
-
 def artifact(stage, file):
     """The pattern of a stage's file in every scene."""
-    return f"{OUTPUT}/{{scene}}/{stage}/{file}"
+    return str(PLAN.output / "{scene}" / stage / file)
 
 
 def log_file(stage, part="job"):
     """The pattern of a job's log."""
-    return f"{OUTPUT}/{{scene}}/logs/{stage}/{part}.log"
+    return str(PLAN.output / "{scene}" / "logs" / stage / f"{part}.log")
 
 
 def files_of(stage, parts):

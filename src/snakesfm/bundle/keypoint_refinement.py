@@ -14,6 +14,7 @@ from snakesfm.bundle.alignment import (
     choose_templates,
 )
 from snakesfm.bundle.reading import observations_of, observed_keypoints
+from snakesfm.grouping import rows_of_each
 
 Array = NDArray[Any]
 
@@ -120,8 +121,7 @@ def _project(reconstruction: pycolmap.Reconstruction, images: Array, in_camera: 
     for image in np.unique(images).tolist():
         cameras[image] = reconstruction.image(image + 1).camera_id
     pixels = np.full((len(images), 2), np.nan)
-    for camera in np.unique(cameras[images]).tolist():
-        rows = np.nonzero(cameras[images] == camera)[0]
+    for camera, rows in rows_of_each(cameras[images]):
         pixels[rows] = reconstruction.camera(camera).img_from_cam(in_camera[rows])
     return pixels
 

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from snakesfm.bundle.reading import observations_of
 from snakesfm.geometry.camera import Camera
 from snakesfm.geometry.poses import to_rigid3d
+from snakesfm.grouping import rows_of_each
 
 Array = NDArray[Any]
 
@@ -142,12 +143,11 @@ def reprojection_errors(model: BundleModel, keypoints: Array) -> Array:
     in_camera = np.einsum("lij,lj->li", rotations, model.points[point_of])
     in_camera += model.translations[model.image_ids]
     errors = np.full(len(point_of), np.inf)
-    camera_of = model.camera_ids[model.image_ids]
-    for camera in np.unique(camera_of).tolist():
-        rows = np.nonzero((camera_of == camera) & (in_camera[:, 2] > 0))[0]
-        if len(rows):
-            projected = model.cameras[camera].to_pycolmap().img_from_cam(in_camera[rows])
-            errors[rows] = np.linalg.norm(np.asarray(projected).reshape(-1, 2) - keypoints[rows], axis=1)
+    ahead = np.nonzero(in_camera[:, 2] > 0)[0]
+    for camera, places in rows_of_each(model.camera_ids[model.image_ids[ahead]]):
+        rows = ahead[places]
+        projected = model.cameras[camera].to_pycolmap().img_from_cam(in_camera[rows])
+        errors[rows] = np.linalg.norm(np.asarray(projected).reshape(-1, 2) - keypoints[rows], axis=1)
     return errors
 
 

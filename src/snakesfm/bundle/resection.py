@@ -17,6 +17,10 @@ Array = NDArray[Any]
 MINIMAL_SAMPLE = 4
 # one more unknown has to explain this many times the matches to be believed
 FOCAL_GAIN = 1.2
+# of other models poselib returns the identity with all matches as inliers
+POSELIB_MODELS = frozenset(
+    {"SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE"}
+)
 
 
 @dataclass(frozen=True)
@@ -62,7 +66,10 @@ def resect(
 def _with_camera(
     camera: pycolmap.Camera, pixels: Array, points: Array, max_error_px: float, seed: int
 ) -> Resection:
-    """LO-RANSAC over P3P with a final refinement, by poselib."""
+    """LO-RANSAC over P3P with a final refinement, by poselib where it knows the camera's model."""
+    if camera.model_name not in POSELIB_MODELS:
+        found = _by_colmap(camera, pixels, points, max_error_px, seed, free_focal=False)
+        return found or Resection(pycolmap.Rigid3d(), camera, np.zeros(len(pixels), dtype=bool))
     description = {
         "model": camera.model_name,
         "width": camera.width,
@@ -88,23 +95,34 @@ def _with_free_focal(
     seed: int,
 ) -> Resection | None:
     """LO-RANSAC over P4Pf with a final refinement of the focal length too, by COLMAP."""
-    free = copy.copy(camera)
-    estimation = pycolmap.AbsolutePoseEstimationOptions()
-    estimation.estimate_focal_length = True
-    estimation.ransac.max_error = max_error_px
-    estimation.ransac.random_seed = seed
-    refinement = pycolmap.AbsolutePoseRefinementOptions()
-    refinement.refine_focal_length = True
-    found = pycolmap.estimate_and_refine_absolute_pose(pixels, points, free, estimation, refinement)
+    found = _by_colmap(camera, pixels, points, max_error_px, seed, free_focal=True)
     if found is None:
         return None
+    free = found.camera
     if free.mean_focal_length() > max_focal_px:
         # so long a lens sees nearly parallel rays, which a somewhat shorter one nearly explains
         params = np.array(free.params)
         params[list(free.focal_length_idxs())] = max_focal_px
         free.params = params
         return _with_camera(free, pixels, points, max_error_px, seed)
+    return found
+
+
+def _by_colmap(
+    camera: pycolmap.Camera, pixels: Array, points: Array, max_error_px: float, seed: int, free_focal: bool
+) -> Resection | None:
+    """LO-RANSAC of COLMAP, which knows all of its models, with a copy of the camera."""
+    used = copy.copy(camera)
+    estimation = pycolmap.AbsolutePoseEstimationOptions()
+    estimation.estimate_focal_length = free_focal
+    estimation.ransac.max_error = max_error_px
+    estimation.ransac.random_seed = seed
+    refinement = pycolmap.AbsolutePoseRefinementOptions()
+    refinement.refine_focal_length = free_focal
+    found = pycolmap.estimate_and_refine_absolute_pose(pixels, points, used, estimation, refinement)
+    if found is None:
+        return None
     seen = found["cam_from_world"] * points
-    errors = np.linalg.norm(free.img_from_cam(seen) - pixels, axis=1)
+    errors = np.linalg.norm(used.img_from_cam(seen) - pixels, axis=1)
     inliers = (seen[:, 2] > 0) & (errors < max_error_px)
-    return Resection(found["cam_from_world"], free, inliers)
+    return Resection(found["cam_from_world"], used, inliers)

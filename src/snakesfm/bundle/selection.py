@@ -13,6 +13,7 @@ from snakesfm.bundle.interface import BundleAdjuster, SolverSettings
 from snakesfm.bundle.model import BundleModel, to_reconstruction
 from snakesfm.bundle.reading import observations_of, observed_keypoints
 from snakesfm.geometry.camera import Camera
+from snakesfm.grouping import rows_of_each
 
 Array = NDArray[Any]
 
@@ -157,9 +158,7 @@ class _Views:
             cameras[image_id - 1] = image.camera_id
             focals[image_id - 1] = reconstruction.camera(image.camera_id).mean_focal_length()
         rays = np.full((len(images), 2), np.nan)
-        camera_of = cameras[images]
-        for camera_id in np.unique(camera_of).tolist():
-            rows = np.flatnonzero(camera_of == camera_id)
+        for camera_id, rows in rows_of_each(cameras[images]):
             rays[rows] = reconstruction.camera(camera_id).cam_from_img(pixels[rows])
         return cls(images, rays, rotations, translations, focals)
 

@@ -12,6 +12,7 @@ from snakesfm.geometry.robust import robust_sigma
 
 Array = NDArray[Any]
 MAX_POINTS = 400
+FEWEST_INLIERS = 20
 # pairs that draw more are seldom usable and take most of the time
 MAX_HYPOTHESES = 500
 
@@ -53,6 +54,11 @@ def estimate_epipolar_pair(
     max_error_px : epipolar error of an inlier; twice this is allowed to a homography.
     planar_ratio : the pair is refused where a homography explains this share of the inliers.
     """
+    # strong distortion cannot be undone everywhere
+    finite = np.isfinite(np.hstack([points_i, points_j])).all(axis=1)
+    points_i, points_j = points_i[finite], points_j[finite]
+    if len(points_i) < FEWEST_INLIERS:
+        return None
     F, info = poselib.estimate_fundamental(
         points_i,
         points_j,
@@ -66,7 +72,7 @@ def estimate_epipolar_pair(
         {"loss_type": "CAUCHY", "loss_scale": 0.5 * max_error_px},
     )
     inliers = np.array(info["inliers"], dtype=bool)
-    if inliers.sum() < max(20, 0.25 * len(inliers)) or not np.isfinite(F).all():
+    if inliers.sum() < max(FEWEST_INLIERS, 0.25 * len(inliers)) or not np.isfinite(F).all():
         return None
     points_i, points_j = points_i[inliers], points_j[inliers]
     _, info = poselib.estimate_homography(

@@ -1,10 +1,11 @@
 """The whole configuration: what config.yaml and ``--config`` may hold."""
 
+import datetime
 import difflib
 import functools
 import importlib
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -36,6 +37,19 @@ STAGES: tuple[str, ...] = (
     "export_model",
     "evaluate_model",
     "render_report",
+)
+
+# what may look like a number or a date and is a name all the same
+TEXT_KEYS = (
+    "images",
+    "output",
+    "scene",
+    "reference",
+    "cameras",
+    "masks",
+    "pairs",
+    "imported",
+    "weights",
 )
 
 SCENE_PATTERN = r"[^/.{}][^/{}]*"
@@ -126,24 +140,39 @@ class RunOptions(BaseModel):
     @model_validator(mode="before")
     @classmethod
     def _accept_numbers(cls, values: Any) -> Any:
-        # --config scene=2024 arrives as a number
+        # --config scene=2024 arrives as a number, 2024-05-01 in a file as a date
         if isinstance(values, dict):
-            for key in (
-                "images",
-                "output",
-                "scene",
-                "reference",
-                "cameras",
-                "masks",
-                "pairs",
-                "imported",
-                "weights",
-            ):
-                if isinstance(values.get(key), int | float) and not isinstance(values[key], bool):
+            for key in TEXT_KEYS:
+                if _is_number(values.get(key)) or isinstance(values.get(key), datetime.date):
                     values = {**values, key: str(values[key])}
             if values.get("scenes") is None and "scenes" in values:
                 values = {**values, "scenes": {}}
+            if isinstance(values.get("scenes"), dict):
+                values = {**values, "scenes": {str(name): of for name, of in values["scenes"].items()}}
         return values
+
+
+def check_spelling(values: Mapping[str, Any], arguments: Sequence[str]) -> None:
+    """Refuse text that Snakemake took for a number: of ``images=100_0042`` nothing but 1000042 is left.
+
+    Parameters
+    ----------
+    values : the configuration as Snakemake has it.
+    arguments : its command line.
+
+    Raises
+    ------
+    ConfigError : the number is spelled otherwise than what was typed.
+    """
+    for key in TEXT_KEYS:
+        typed = [text.partition("=")[2] for text in arguments if text.startswith(f"{key}=")]
+        if typed and _is_number(values.get(key)) and typed[-1] != str(values[key]):
+            remedy = f"write {key}=./{typed[-1]}" if key != "scene" else "give it another name"
+            raise ConfigError(f"Snakemake takes {key}={typed[-1]} for the number {values[key]}: {remedy}.")
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
 
 
 @functools.cache

@@ -135,7 +135,7 @@ def _native_terms(camera: Camera, terms: tuple[str, ...]) -> dict[str, float] | 
         if name in {"f", "fx", "fy", "cx", "cy"}:
             continue
         name = "k1" if name == "k" else name
-        if name in found and "THIN_PRISM" not in camera.model:
+        if name in found and "THIN_PRISM" not in camera.model and "DIVISION" not in camera.model:
             found[name] = float(value)
         elif value != 0.0 or camera.model == "FOV":
             return None

@@ -10,6 +10,8 @@ import numpy as np
 from snakesfm.geometry.colmap_binding import pycolmap
 from snakesfm.ingest.masks import find_mask, read_mask
 
+JPEG_SUFFIXES = (".jpg", ".jpeg")
+
 
 def write_undistorted(target: Path, sparse: Path, images: Path, masks: Path | None, threads: int) -> None:
     """Write ``target``/images and ``target``/sparse/0 with PINHOLE cameras, for tools that know no other.
@@ -24,9 +26,11 @@ def write_undistorted(target: Path, sparse: Path, images: Path, masks: Path | No
 
     Raises
     ------
+    ImageError : an image can no longer be read.
     ConfigError : a mask cannot be used.
     """
     pycolmap.undistort_images(str(target), str(sparse), str(images), num_threads=threads)
+    _write_others(target / "images", sparse, images, threads)
     flat = target / "sparse"
     model = target / "model"
     flat.rename(model)
@@ -37,6 +41,30 @@ def write_undistorted(target: Path, sparse: Path, images: Path, masks: Path | No
         script.unlink()
     if masks is not None:
         _write_masks(target / "masks", sparse, masks, threads)
+
+
+def _write_others(target: Path, sparse: Path, images: Path, threads: int) -> None:
+    """Write what is no JPEG from the pixels that keypoints were found in.
+
+    COLMAP reads no WebP, makes 12 bits in a file of 16 dark, and writes some TIFF files as none can read.
+    """
+    # most jobs need no more than JPEG
+    from PIL import Image
+
+    from snakesfm.ingest.read import read_image
+
+    options = pycolmap.UndistortCameraOptions()
+    model = pycolmap.Reconstruction(str(sparse))
+
+    def write(image: "pycolmap.Image") -> None:
+        if image.name.lower().endswith(JPEG_SUFFIXES):
+            return
+        pixels = pycolmap.Bitmap.from_array(read_image(images / image.name).rgb)
+        bitmap, _ = pycolmap.undistort_image(options, pixels, model.cameras[image.camera_id])
+        Image.fromarray(bitmap.to_array()).save(target / image.name, lossless=True)
+
+    with ThreadPoolExecutor(threads) as pool:
+        list(pool.map(write, [model.images[image_id] for image_id in model.reg_image_ids()]))
 
 
 def _write_masks(target: Path, sparse: Path, masks: Path, threads: int) -> None:

@@ -12,6 +12,7 @@ if TYPE_CHECKING:
 
 Array = NDArray[Any]
 PARAM_SLOTS = 12
+ROUND_TRIP_PX = 1.0
 
 
 @dataclass(frozen=True)
@@ -51,11 +52,16 @@ class Camera:
         return cls(camera.model_name, camera.width, camera.height, params, source)
 
     def normalize(self, keypoints: Array) -> Array:
-        """Pixels (N,2) to undistorted points (N,2) on the plane z = 1 of the camera frame."""
+        """Pixels (N,2) to undistorted points (N,2) on the plane z = 1 of the camera frame, NaN if none."""
         if len(keypoints) == 0:
             return np.zeros((0, 2))
-        points = self.to_pycolmap().cam_from_img(np.asarray(keypoints, dtype=np.float64))
-        return np.asarray(points).reshape(-1, 2)
+        camera, pixels = self.to_pycolmap(), np.asarray(keypoints, dtype=np.float64)
+        points = np.asarray(camera.cam_from_img(pixels)).reshape(-1, 2)
+        if "FISHEYE" in self.model:
+            # of angles beyond 90 degrees, which no plane holds, COLMAP gives some point of it
+            again = np.asarray(camera.img_from_cam(np.column_stack([points, np.ones(len(points))])))
+            points[~(np.linalg.norm(again.reshape(-1, 2) - pixels, axis=1) < ROUND_TRIP_PX)] = np.nan
+        return points
 
     @property
     def focal_px(self) -> float:

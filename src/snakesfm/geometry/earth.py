@@ -19,8 +19,12 @@ def local_origin(gps: Array) -> Origin | None:
     known = gps[np.isfinite(gps).all(axis=1)]
     if not len(known):
         return None
-    latitude, longitude, altitude = np.median(known, axis=0).tolist()
-    return latitude, longitude, altitude
+    # counted from one of them, longitudes do not jump at the 180th meridian
+    first = known[0, 1]
+    eastward = (known[:, 1] - first + 180.0) % 360.0 - 180.0
+    latitude, altitude = np.median(known[:, [0, 2]], axis=0).tolist()
+    longitude = (first + float(np.median(eastward)) + 180.0) % 360.0 - 180.0
+    return latitude, float(longitude), altitude
 
 
 def local_metres(gps: Array, origin: Origin) -> Array:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from snakesfm.geometry.camera import Camera
 from snakesfm.geometry.colmap_binding import pycolmap
-from snakesfm.ingest.exif import Exif, focal_from_exif, is_cropped
+from snakesfm.ingest.exif import Exif, focal_from_exif, is_cropped, is_of_stated_size
 
 Array = NDArray[Any]
 Sharing = Literal["auto", "exif", "single", "per_folder", "per_image"]
@@ -116,17 +116,26 @@ def find_cropped(photographs: Sequence[Photograph]) -> list[bool]:
     That is seen in the image's shape (:func:`snakesfm.ingest.exif.is_cropped`), or in a folder whose images
     have all one size though many camera models took them.
     """
+    of_one_size = _folders_of_one_size(photographs)
+    return [
+        p.folder in of_one_size or (p.body is not None and is_cropped(p.exif, p.width, p.height))
+        for p in photographs
+    ]
+
+
+def _folders_of_one_size(photographs: Sequence[Photograph]) -> set[str]:
+    """Folders whose images have all one size though many camera models took them."""
     sizes = defaultdict(set)
     bodies = defaultdict(set)
     for photograph in photographs:
         sizes[photograph.folder].add((photograph.width, photograph.height))
         if photograph.body:
             bodies[photograph.folder].add(photograph.body)
-    return [
-        (len(sizes[p.folder]) == 1 and len(bodies[p.folder]) >= MODELS_OF_ONE_SIZE)
-        or (p.body is not None and is_cropped(p.exif, p.width, p.height))
-        for p in photographs
-    ]
+    return {
+        folder
+        for folder, found in sizes.items()
+        if len(found) == 1 and len(bodies[folder]) >= MODELS_OF_ONE_SIZE
+    }
 
 
 def group_images(photographs: Sequence[Photograph], sharing: Sharing) -> list[Hashable]:
@@ -137,8 +146,8 @@ def group_images(photographs: Sequence[Photograph], sharing: Sharing) -> list[Ha
     photographs : the images.
     sharing : ``single``, ``per_folder`` and ``per_image`` as they say. ``exif``: by camera, lens and focal
         length; images without EXIF each have their own. ``auto``: as ``exif``, but cropped images have
-        their own, and images without EXIF share per folder where their sizes agree as one camera's do, a
-        few strays apart.
+        their own, unless EXIF states their very size, as of sensors of 5:4. Images without EXIF share per
+        folder where their sizes agree as one camera's do, a few strays apart.
     """
     if sharing == "single":
         return [(p.width, p.height) for p in photographs]
@@ -148,11 +157,13 @@ def group_images(photographs: Sequence[Photograph], sharing: Sharing) -> list[Ha
         return [p.name for p in photographs]
     if sharing == "exif":
         return [_exif_key(p) if p.body else p.name for p in photographs]
-    shared = _shared_sizes(photographs)
+    shared, of_one_size = _shared_sizes(photographs), _folders_of_one_size(photographs)
     keys: list[Hashable] = []
     for photograph, cropped in zip(photographs, find_cropped(photographs), strict=True):
         if photograph.body:
-            keys.append(photograph.name if cropped else _exif_key(photograph))
+            whole = is_of_stated_size(photograph.exif, photograph.width, photograph.height)
+            own = cropped and not (whole and photograph.folder not in of_one_size)
+            keys.append(photograph.name if own else _exif_key(photograph))
         elif (photograph.folder, photograph.sides) in shared:
             keys.append((photograph.folder, photograph.width, photograph.height))
         else:

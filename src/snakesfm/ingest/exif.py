@@ -18,6 +18,8 @@ FOCAL_RATIO_RANGE = (0.25, 25.0)
 # sensors are 4:3 or longer; what is squarer or as long as a panorama was cropped or stitched
 ASPECT_RANGE = (1.3, 2.4)
 ASPECT_TOLERANCE = 0.02
+# thermal, multispectral and machine vision cameras have 5:4 and 6:5
+SQUAREST_SENSOR = 1.15
 NO_PLACE: Triple = (math.nan, math.nan, math.nan)
 
 
@@ -98,6 +100,15 @@ def is_cropped(exif: Exif, width: int, height: int) -> bool:
         return False
     taken = max(exif.width, exif.height) / min(exif.width, exif.height)
     return abs(aspect / taken - 1) > ASPECT_TOLERANCE
+
+
+def is_of_stated_size(exif: Exif, width: int, height: int) -> bool:
+    """Whether EXIF states an image's very size, and its shape may be a sensor's: 5:4 is, a square is not.
+
+    Programs that crop write the new size into EXIF, so it proves little of a shape that many crop to.
+    """
+    square = max(width, height) < SQUAREST_SENSOR * min(width, height)
+    return not square and {exif.width, exif.height} == {width, height}
 
 
 @functools.lru_cache(maxsize=4096)

@@ -106,7 +106,11 @@ def read_image(path: Path | str, shorter_side_px: int | None = None) -> ImagePix
             if image.format in ("JPEG", "MPO") and image.mode in ("RGB", "L"):
                 return _decode_jpeg(Path(path), min(image.size), shorter_side_px)
             turn_back = UNDO_TURN.get(_tiff_orientation(image))
+            # loading drops what tells the depth, but no damage passes it
+            deep = _has_deep_colours(image)
             image.load()
+            if deep:
+                return _decode_deep_colours(Path(path))
             return _to_pixels(image if turn_back is None else image.transpose(turn_back))
         # PIL raises errors of every type on damaged files, and one bad image must not stop the others
         except Exception as error:
@@ -234,6 +238,19 @@ def _decode_jpeg(path: Path, side: int, shorter_side_px: int | None) -> ImagePix
     return ImagePixels(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), rgb, reduction)
 
 
+def _has_deep_colours(image: Image.Image) -> bool:
+    """Whether PIL would cut colours of 16 bits to their upper 8."""
+    return image.mode in ("RGB", "RGBA") and any(";16" in str(tile[3]) for tile in image.tile)
+
+
+def _decode_deep_colours(path: Path) -> ImagePixels:
+    flags = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
+    bgr = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), flags)
+    if bgr is None:
+        raise ValueError("it cannot be decoded")
+    return _from_rgb(cv2.cvtColor(_to_8_bit(bgr), cv2.COLOR_BGR2RGB))
+
+
 def _to_pixels(image: Image.Image) -> ImagePixels:
     if image.mode.startswith(("I", "F")):
         return _from_gray(_to_8_bit(np.asarray(image)))
@@ -255,7 +272,7 @@ def _from_rgb(rgb: Array) -> ImagePixels:
 
 
 def _to_8_bit(values: Array) -> Array:
-    """Gray values (H,W) of any type to uint8."""
+    """Gray values (H,W) or colours (H,W,3) of any type to uint8."""
     if values.dtype.kind == "f":
         values = np.nan_to_num(values, nan=0.0, posinf=0.0, neginf=0.0)
         low, high = float(values.min()), float(values.max())

@@ -29,8 +29,9 @@ def tree_rotations(node_count: int, pairs: Array, rotations: Array, costs: Array
     keys = pairs[:, 0] * node_count + pairs[:, 1]
     averaged = np.empty((node_count, 3, 3))
     averaged[root] = np.eye(3)
-    children = order[1:]
-    above = parents[children]
+    # SciPy gives int32, which keys of 50,000 images exceed
+    children = order[1:].astype(np.int64)
+    above = parents[children].astype(np.int64)
     edges = np.searchsorted(keys, np.minimum(children, above) * node_count + np.maximum(children, above))
     steps = np.where(
         (above < children)[:, None, None], rotations[edges], rotations[edges].transpose(0, 2, 1)

@@ -25,6 +25,7 @@ from snakesfm.translation_averaging.problem import (
     world_rays,
 )
 from snakesfm.translation_averaging.support import SupportLimits
+from snakesfm.triangulation.tracks import undistort
 
 if TYPE_CHECKING:
     from snakesfm.config.average_translations import AverageTranslationsOptions
@@ -58,10 +59,7 @@ def run(job: StageJob) -> None:
     by_part = np.argsort(tracks.part_ids, kind="stable")
     image_ids, keypoints = tracks.image_ids[by_part], tracks.keypoints[by_part]
     rows = turned[image_ids]
-    normalized = np.zeros((len(rows), 2))
-    for camera_id, camera in enumerate(cameras):
-        mine = index.camera_ids[image_ids] == camera_id
-        normalized[mine] = camera.normalize(keypoints[mine])
+    normalized = undistort(cameras, index.camera_ids, image_ids, keypoints)
     rows &= np.isfinite(normalized.sum(axis=1))
     pairs = graph.pairs[usable].astype(np.int64)
     images = image_ids[rows].astype(np.int64)

@@ -19,7 +19,7 @@ from snakesfm.export.colmap import (
 )
 from snakesfm.export.georeference import Georeference, georeference
 from snakesfm.export.image_folder import place_images
-from snakesfm.export.nerfstudio import camera_warnings, transforms
+from snakesfm.export.nerfstudio import camera_warnings, is_fisheye, transforms
 from snakesfm.export.undistorted import write_undistorted
 from snakesfm.geometry.camera import Camera, cameras_from_columns
 from snakesfm.geometry.earth import local_origin
@@ -50,6 +50,11 @@ MISSING_MASKS = (
     "images have none such, '{first}' for one."
 )
 
+MIXED_LENSES = (
+    "transforms.json holds fisheye and perspective cameras, which nerfstudio takes for one kind: use "
+    "export_model={undistort: true}, or a scene for each kind."
+)
+
 REFUSED = "{count} image files could not be used (all in the report): {first}"
 
 OTHER_LENS = (
@@ -74,6 +79,8 @@ def run(job: StageJob) -> None:
     used = sorted({int(index.camera_ids[row]) for row in registered})
     warnings = [line for row in used for line in camera_warnings(cameras[row], row + 1)]
     warnings += _lens_warnings(model, cameras, index.camera_ids)
+    if len({is_fisheye(cameras[row]) for row in used}) > 1:
+        warnings.append(MIXED_LENSES)
     if any(" " in names[row] for row in registered):
         warnings.append(SPACES)
     others = other_model_sizes(adjusted.models)

@@ -58,8 +58,10 @@ def run(job: StageJob) -> None:
     names = [str(name) for name in index.names[rows]]
     masks = _find_masks(job, names)
     contents = {name: file_digest(str(path)) for name, path in masks.items()}
+    # known keypoints are found by the image's name
+    named = isinstance(finder, KeypointSource)
     digests = [
-        _digest(str(sha256), options, beside + contents.get(name, ""))
+        _digest(str(sha256), options, beside + contents.get(name, "") + (name if named else ""))
         for sha256, name in zip(index.sha256[rows], names, strict=True)
     ]
     former = job.take_over(digests, _read_former)

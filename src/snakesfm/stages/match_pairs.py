@@ -200,8 +200,11 @@ class ImageFiles:
 
     def __init__(self, job: StageJob) -> None:
         index = ImageIndex.read(job.paths("index")[0])
-        self.digests = [str(digest) for digest in index.sha256]
         self._names = [str(name) for name in index.names]
+        self.digests = [str(digest) for digest in index.sha256]
+        if job.options.method == "virtual_places":
+            # the oracle knows an image by its name
+            self.digests = [" ".join(both) for both in zip(self.digests, self._names, strict=True)]
         self._sizes = [(width, height) for width, height in index.sizes.tolist()]
         self._folder = Path(job.settings["images"])
         self._side_px = int(job.options.longer_side_px)

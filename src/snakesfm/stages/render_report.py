@@ -65,7 +65,7 @@ def run(job: StageJob) -> None:
     metrics = json.loads(job.path("metrics").read_text("utf-8"))
     summary = json.loads(job.path("summary").read_text("utf-8")) if "summary" in job.inputs else {}
     # no declared inputs: a lost log is no reason to run the job again
-    logs = (job.output.parents[1] / "logs").rglob("*.log")
+    logs = _logs_in_use(job.output.parents[1] / "logs", job.paths("geometries"))
 
     count = len(index.names)
     names = [str(name) for name in index.names]
@@ -137,6 +137,13 @@ def run(job: StageJob) -> None:
     )
     with atomic_path(job.output) as temporary:
         temporary.write_text(render_page(page), "utf-8")
+
+
+def _logs_in_use(folder: Path, tile_files: Sequence[Path]) -> list[Path]:
+    """The logs of jobs: those of blocks and tiles that a run with more blocks had are left out."""
+    tiles = {path.stem for path in tile_files}
+    parts = {"job", *tiles, *(block for tile in tiles for block in tile.split("-"))}
+    return [path for path in folder.rglob("*.log") if path.stem in parts]
 
 
 def _read_columns(kind: type[Any], path: Path, columns: Sequence[str]) -> dict[str, Array]:

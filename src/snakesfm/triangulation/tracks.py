@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from snakesfm.geometry.camera import Camera
+from snakesfm.grouping import rows_of_each
 from snakesfm.triangulation.interface import TriangulationLimits, TriangulationProblem, Triangulator
 
 Array = NDArray[Any]
@@ -74,9 +75,7 @@ def triangulate_tracks(
 def undistort(cameras: Sequence[Camera], camera_ids: Array, image_ids: Array, keypoints: Array) -> Array:
     """Points (L,2) on the plane z = 1 of pixels (L,2) of several images."""
     rays = np.full((len(image_ids), 2), np.nan)
-    camera_of = camera_ids[image_ids]
-    for camera in np.unique(camera_of).tolist():
-        rows = camera_of == camera
+    for camera, rows in rows_of_each(camera_ids[image_ids]):
         rays[rows] = cameras[camera].normalize(keypoints[rows])
     return rays
 

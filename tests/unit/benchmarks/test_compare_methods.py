@@ -95,6 +95,23 @@ def test_cameras_are_told_as_the_reference_has_them(synthetic: Path) -> None:
     assert ImageSet(synthetic, False, True).pinhole() is None
 
 
+def test_unknown_cameras_are_shared_as_in_the_reference(tmp_path: Path) -> None:
+    names = [f"{k}.jpg" for k in range(6)]
+    (tmp_path / "images").mkdir()
+    for name in names:
+        (tmp_path / "images" / name).touch()
+    cameras = "".join(f"{k} SIMPLE_PINHOLE 64 48 50 32 24\n" for k in (1, 2))
+    poses = "".join(f"{k + 1} 1 0 0 0 0 0 0 {1 + k // 3} {name}\n\n" for k, name in enumerate(names[:5]))
+    (tmp_path / "reference").mkdir()
+    for file, text in (("cameras", cameras), ("images", poses), ("points3D", "")):
+        (tmp_path / "reference" / f"{file}.txt").write_text(text)
+    assert ImageSet(tmp_path, False, True).camera_groups() == [
+        {"names": names[:3], "mode": "SINGLE"},
+        {"names": names[3:5], "mode": "SINGLE"},
+        {"names": names[5:], "mode": "PER_IMAGE"},
+    ]
+
+
 def test_a_folder_that_is_no_set_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"lacking is no image set: it needs images/ and reference/"):
         read_sets(tmp_path, ["lacking"])

@@ -121,3 +121,26 @@ def test_only_images_that_share_their_camera_with_none_leave_with_it():
     reconstruction = to_reconstruction(model, made.keypoints, NAMES)
     assert deregister_images_alone(reconstruction, [2, 3]) == {3}
     assert set(reconstruction.reg_image_ids()) == set(range(1, 13)) - {2}
+
+
+@pytest.mark.parametrize(
+    ("model", "params"),
+    [
+        ("SIMPLE_RADIAL_FISHEYE", [500.0, 400.0, 300.0, 0.02]),
+        ("RADIAL_FISHEYE", [500.0, 400.0, 300.0, 0.02, 0.001]),
+        ("OPENCV_FISHEYE", [500.0, 500.0, 400.0, 300.0, 0.02, 0.0, 0.0, 0.0]),
+        ("FOV", [500.0, 500.0, 400.0, 300.0, 0.5]),
+        ("OPENCV", [500.0, 510.0, 400.0, 300.0, -0.1, 0.01, 0.0, 0.0]),
+    ],
+)
+def test_every_camera_model_tells_matches_from_chance(model, params):
+    camera = pycolmap.Camera(model=model, width=800, height=600, params=params)
+    rng = np.random.default_rng(3)
+    points = rng.uniform(-1, 1, (120, 3)) * [6.0, 5.0, 4.0]
+    pixels = camera.img_from_cam(POSE * points)
+    pixels[:40] = rng.uniform(0, [800, 600], (40, 2))
+    found = resect(camera, pixels, points, 2.0, 0.0, 0)
+    assert 80 <= found.support <= 84 and found.inliers[40:].all()
+    assert np.degrees(angle_of(found.pose.rotation.matrix().T @ TURN.matrix())) < 0.05
+    strangers = resect(camera, rng.uniform(0, [800, 600], (120, 2)), points, 2.0, 0.0, 0)
+    assert strangers.support < 15

@@ -170,6 +170,19 @@ def epipolar_pairs(focal: float, count: int) -> list[EpipolarPair]:
     return [pair for pair in found if pair is not None]
 
 
+def test_pixels_without_a_ray_take_no_part() -> None:
+    pair = view_pair(1, 900, 1300)
+    points_i, points_j = pair.points_i - CENTER, pair.points_j - CENTER
+    points_i[3], points_j[7] = np.nan, np.nan
+    whole = np.ones(len(points_i), dtype=bool)
+    whole[[3, 7]] = False
+    found = estimate_epipolar_pair(0, 1, points_i, points_j, 1.0, 0.8, 0)
+    expected = estimate_epipolar_pair(0, 1, points_i[whole], points_j[whole], 1.0, 0.8, 0)
+    assert found is not None and expected is not None
+    np.testing.assert_array_equal(found.F, expected.F)
+    assert estimate_epipolar_pair(0, 1, np.full((30, 2), np.nan), points_j[:30], 1.0, 0.8, 0) is None
+
+
 def test_defect_is_that_of_the_singular_values() -> None:
     pair = view_pair(1, 900, 1300)
     found = estimate_epipolar_pair(0, 1, pair.points_i - CENTER, pair.points_j - CENTER, 1.0, 0.8, 0)

@@ -121,7 +121,7 @@ def test_equal_centres_have_no_direction_in_the_reference_and_fail_in_the_model_
     assert direction == pytest.approx([0.0, 0.0, 0.0, 180.0, 0.0, 180.0], abs=1e-6)
 
 
-@pytest.mark.parametrize("count", [1, 2, 3, 20])
+@pytest.mark.parametrize("count", [1, 2, 3, 20, 1000, 1001])
 def test_alignment_recovers_any_similarity_also_for_few_cameras(count) -> None:
     rotations, centers = random_poses(count)
     model_rotations, model_centers, turn, _ = transformed(rotations, centers)

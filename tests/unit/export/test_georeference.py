@@ -66,6 +66,12 @@ def test_few_positions_tell_nothing():
 def test_the_origin_is_the_middle_and_the_result_is_that_of_the_seed():
     centers, gps, _ = survey()
     assert np.all(np.abs(np.array(local_origin(gps)) - ORIGIN) < (1e-3, 1e-3, 5.0))
+    for east in (170.0, 180.0, -180.0, 359.0):
+        moved = np.array(gps)
+        moved[:, 1] = (gps[:, 1] - ORIGIN[1] + east + 180.0) % 360.0 - 180.0
+        off = (local_origin(moved)[1] - east + 180.0) % 360.0 - 180.0
+        assert abs(off) < 1e-3
+        assert -180.0 <= local_origin(moved)[1] < 180.0
     first, second = (georeference(centers, gps, ORIGIN, 7).local_from_model for _ in range(2))
     np.testing.assert_array_equal(first.rotation, second.rotation)
     assert first.scale == second.scale

@@ -65,6 +65,8 @@ def test_terms_with_a_name_are_copied_and_project_alike(model) -> None:
     ("model", "params"),
     [
         ("FOV", (500.0, 500.0, 320.0, 240.0, 0.6)),
+        ("SIMPLE_DIVISION", (500.0, 320.0, 240.0, -0.2)),
+        ("DIVISION", (500.0, 510.0, 320.0, 240.0, 0.1)),
         ("FULL_OPENCV", (500.0, 510.0, 320.0, 240.0, 0.1, 0.02, 1e-3, 2e-3, 0.01, 0.15, 0.01, 0.001)),
         (
             "THIN_PRISM_FISHEYE",

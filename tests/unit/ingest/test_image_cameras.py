@@ -1,3 +1,5 @@
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -88,6 +90,17 @@ def test_cropped_images_are_not_trusted():
     assert {camera.source for camera in square.cameras} == {"default"}
     assert square.cameras[0].focal_px == pytest.approx(1.2 * 760)
     assert np.isnan(square.focal_exif_px).all()
+
+
+@pytest.mark.parametrize(
+    ("size", "stated", "cameras"),
+    [((950, 760), (950, 760), 1), ((950, 760), (1140, 760), 3), ((760, 760), (760, 760), 3)],
+)
+def test_images_of_a_sensor_of_5_to_4_share_a_camera(size, stated, cameras):
+    exif = dataclasses.replace(PHONE, width=stated[0], height=stated[1])
+    found = assign(photos("a", [size] * 3, exif))
+    assert len(found.cameras) == cameras
+    assert {camera.source for camera in found.cameras} == {"default"}
 
 
 def test_one_size_of_many_cameras_is_not_trusted():

@@ -97,6 +97,14 @@ def test_16_bit_colour_and_12_bit_data(tmp_path, picture):
     np.testing.assert_array_equal(read_image(twelve).gray, gray)
 
 
+@pytest.mark.parametrize("name", ["deep.png", "deep.tif"])
+def test_colours_of_12_bits_in_16_are_not_dark(tmp_path, picture, name):
+    path = tmp_path / name
+    bright = np.maximum(picture, 200)
+    cv2.imwrite(str(path), cv2.cvtColor(bright.astype(np.uint16) << 4, cv2.COLOR_RGB2BGR))
+    np.testing.assert_array_equal(read_image(path).rgb, bright)
+
+
 def test_one_bit_and_transparent_pixels(tmp_path, picture):
     bits = picture[..., 0] > 127
     path = save(Image.fromarray(bits), tmp_path / "bits.png")

@@ -47,6 +47,18 @@ def test_tree_avoids_costly_edges():
     assert angle_of(averaged @ gauge @ truth.transpose(0, 2, 1)).max() < 1e-6
 
 
+def test_tree_of_more_nodes_than_32_bits_can_pair():
+    # the root is the last node, so that keys of its edges are the largest there are
+    count = 50_000
+    pairs = np.column_stack([np.arange(count - 1), np.full(count - 1, count - 1)])
+    rng = np.random.default_rng(2)
+    turns = Rotation.random(count - 1, random_state=rng).as_matrix()
+    averaged = tree_rotations(count, pairs, turns, np.ones(len(pairs)))
+    assert (
+        angle_of(averaged[pairs[:, 1]] @ averaged[pairs[:, 0]].transpose(0, 2, 1) @ turns.mT).max() < 1e-6
+    )
+
+
 @pytest.mark.parametrize("edge_count", [60, 40_000])
 def test_linear_steps_minimise_their_cost(edge_count):
     # 40,000 edges of 700 nodes are solved iteratively, few ones directly
