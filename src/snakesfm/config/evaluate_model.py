@@ -10,7 +10,7 @@ from snakesfm.config.base import StageOptions
 class EvaluateModelOptions(StageOptions):
     """Which thresholds the metrics use."""
 
-    stage_version: ClassVar[int] = 3
+    stage_version: ClassVar[int] = 4
 
     relative_thresholds_deg: tuple[float, ...] = Field((1.0, 3.0, 5.0, 10.0, 20.0), min_length=1)
     """Thresholds of the AUC over the relative poses of all pairs of reference images, in degrees."""

@@ -10,7 +10,7 @@ from snakesfm.config.base import StageOptions
 class TriangulateTracksOptions(StageOptions):
     """How points are made of tracks."""
 
-    stage_version: ClassVar[int] = 1
+    stage_version: ClassVar[int] = 2
 
     method: Literal["ransac_dlt", "pycolmap"] = "ransac_dlt"
     """RANSAC over pairs of observations with a linear solution of the inliers, or pycolmap's LO-RANSAC."""
