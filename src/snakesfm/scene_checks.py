@@ -37,6 +37,11 @@ def _check_images(scene: ScenePlan) -> None:
             "--config images=PATH (name a path with ' #' in it in a file for --configfile: "
             "Snakemake cuts it there)."
         )
+    if scene.folder.resolve() == images.resolve():
+        raise ConfigError(
+            f"Scene '{scene.name}' would be written into its own image folder '{images}': give it another "
+            "scene=NAME or another output=DIR."
+        )
     if scene.folder.resolve().is_relative_to(images.resolve()):
         raise ConfigError(
             f"The output folder '{scene.folder.parent}' lies inside the image folder '{images}', so its "

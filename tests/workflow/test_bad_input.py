@@ -45,6 +45,7 @@ def texture(seed: int) -> Image.Image:
         (["images=photos", "reference=nowhere"], ["nowhere", "reference="]),
         (["images=photos", "output=photos/out"], ["photos/out", "inside the image folder"]),
         (["images=photos", "scene=a/b"], ["a/b", "scene=NAME"]),
+        (["images=photos", "output=."], ["its own image folder 'photos'", "scene=NAME"]),
         (["images=100_0042"], ["images=100_0042 for the number 1000042", "images=./100_0042"]),
         (["images=photos", "select_pairs={method: listed}"], ["pairs="]),
     ],

@@ -235,7 +235,7 @@ def test_places_found_pair_by_pair_are_merged(
     assert set(outcome.rules) == {"merge_keypoints", "index_matches"}
     (out / "match_pairs" / "0-1.h5").unlink()
     run(workflow, small_scene, *config)
-    assert "60 pairs (60 taken over)" in (out / "logs" / "match_pairs" / "0-1.log").read_text()
+    assert "64 pairs (64 taken over)" in (out / "logs" / "match_pairs" / "0-1.log").read_text()
 
 
 def test_loftr_runs_through_with_random_weights(small_scene: Path, workflow: Workflow) -> None:

@@ -9,7 +9,6 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from snakesfm.bundle.filtering import images_of
 from snakesfm.bundle.reading import observations_of
 from snakesfm.bundle.resection import resect
 
@@ -59,12 +58,13 @@ def register_left_out(
         if second in matched:
             matched[second].append(first)
     found = {image: _matched_points(graph, image, others, observed) for image, others in matched.items()}
+    in_use = {reconstruction.image(image_id).camera_id for image_id in reconstruction.reg_image_ids()}
     done = []
     for image_id in sorted(left_out, key=lambda image: (-len(found[image]), image)):
         if len(found[image_id]) < min_inliers:
             continue
         camera_id = reconstruction.image(image_id).camera_id
-        max_focal_px = 0.0 if images_of(reconstruction, camera_id) else max_focals_px.get(camera_id, 0.0)
+        max_focal_px = 0.0 if camera_id in in_use else max_focals_px.get(camera_id, 0.0)
         if _register(
             reconstruction,
             image_id,
@@ -76,6 +76,7 @@ def register_left_out(
             seed,
         ):
             done.append(image_id - 1)
+            in_use.add(camera_id)
     return done
 
 

@@ -39,6 +39,7 @@ LOG_STEP = 1e-4
 SMALL_LOG_STEP = 1e-3
 MIN_STRENGTH = 2.0
 MAX_LOG_STEP = 0.25
+COLUMNS_AT_ONCE = 256
 # at most so many points tell which of four poses has them in front of both cameras
 POINTS_IN_FRONT = 50
 # like the builtin map; that of a pool works on several items at a time
@@ -98,8 +99,21 @@ def adjust_focals(
     first, second = cameras[agrees].T
     agreeing = np.bincount(first, minlength=len(focals))
     agreeing += np.bincount(second[first != second], minlength=len(focals))
-    sigmas = np.sqrt(np.diag(np.linalg.inv(found.information.toarray()))) * ~held
+    sigmas = np.sqrt(inverse_diagonal(found.information)) * ~held
     return FocalAdjustment(np.exp(found.logs), sigmas, agreeing.astype(np.int32))
+
+
+def inverse_diagonal(matrix: Any) -> Array:
+    """Diagonal (C,) of the inverse of a sparse matrix, whose columns are not all held at once."""
+    count = matrix.shape[0]
+    factor = splu(matrix.tocsc())
+    diagonal = np.empty(count)
+    for start in range(0, count, COLUMNS_AT_ONCE):
+        rows = np.arange(start, min(start + COLUMNS_AT_ONCE, count))
+        units = np.zeros((count, len(rows)))
+        units[rows, rows - start] = 1.0
+        diagonal[rows] = factor.solve(units)[rows, rows - start]
+    return diagonal
 
 
 def adjust_condensed(

@@ -5,11 +5,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.sparse import diags_array, random_array
 
 from snakesfm.calibration.adjustment import (
     adjust_condensed,
     adjust_focals,
     correspondences_of,
+    inverse_diagonal,
     pose_of,
     refined_pose,
 )
@@ -168,6 +170,16 @@ def epipolar_pairs(focal: float, count: int) -> list[EpipolarPair]:
         for p in pairs
     ]
     return [pair for pair in found if pair is not None]
+
+
+@pytest.mark.parametrize("count", [1, 255, 256, 600])
+def test_diagonal_of_an_inverse_is_that_of_the_whole(count: int) -> None:
+    rng = np.random.default_rng(count)
+    links = random_array((count, count), density=0.01, rng=rng)
+    matrix = links @ links.T + diags_array(rng.uniform(0.5, 2.0, count))
+    np.testing.assert_allclose(
+        inverse_diagonal(matrix), np.diag(np.linalg.inv(matrix.toarray())), rtol=1e-9
+    )
 
 
 def test_pixels_without_a_ray_take_no_part() -> None:
