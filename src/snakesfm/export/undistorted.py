@@ -44,7 +44,7 @@ def write_undistorted(target: Path, sparse: Path, images: Path, masks: Path | No
 
 
 def _write_others(target: Path, sparse: Path, images: Path, threads: int) -> None:
-    """Write what is no JPEG from the pixels that keypoints were found in.
+    """Write what is no JPEG, whatever its name says, from the pixels that keypoints were found in.
 
     COLMAP reads no WebP, makes 12 bits in a file of 16 dark, and writes some TIFF files as none can read.
     """
@@ -57,11 +57,12 @@ def _write_others(target: Path, sparse: Path, images: Path, threads: int) -> Non
     model = pycolmap.Reconstruction(str(sparse))
 
     def write(image: "pycolmap.Image") -> None:
-        if image.name.lower().endswith(JPEG_SUFFIXES):
+        file = target / image.name
+        if image.name.lower().endswith(JPEG_SUFFIXES) and file.is_file():
             return
         pixels = pycolmap.Bitmap.from_array(read_image(images / image.name).rgb)
         bitmap, _ = pycolmap.undistort_image(options, pixels, model.cameras[image.camera_id])
-        Image.fromarray(bitmap.to_array()).save(target / image.name, lossless=True)
+        Image.fromarray(bitmap.to_array()).save(file, lossless=True, quality=95)
 
     with ThreadPoolExecutor(threads) as pool:
         list(pool.map(write, [model.images[image_id] for image_id in model.reg_image_ids()]))

@@ -239,8 +239,9 @@ def _decode_jpeg(path: Path, side: int, shorter_side_px: int | None) -> ImagePix
 
 
 def _has_deep_colours(image: Image.Image) -> bool:
-    """Whether PIL would cut colours of 16 bits to their upper 8."""
-    return image.mode in ("RGB", "RGBA") and any(";16" in str(tile[3]) for tile in image.tile)
+    """Whether PIL would cut opaque colours of 16 bits to their upper 8."""
+    opaque = image.mode == "RGB" and not image.has_transparency_data
+    return opaque and any(";16" in str(tile[3]) for tile in image.tile)
 
 
 def _decode_deep_colours(path: Path) -> ImagePixels:
