@@ -51,8 +51,6 @@ class ImageSet:
         model = read_model(self.reference)
         if not self.known and len(model.cameras) == len(model.images):
             return [{"names": [], "mode": "PER_IMAGE"}]
-        if not self.known and len(model.cameras) == 1:
-            return [{"names": [], "mode": "SINGLE"}]
         members = defaultdict(list)
         for image in model.images.values():
             members[image.camera_id].append(image.name)

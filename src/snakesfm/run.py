@@ -155,8 +155,6 @@ class Run:
         self._note("")
         for scene in self.plan.scenes.values():
             print(self.describe(scene), flush=True)
-            if self._is_outdated(scene):
-                continue
             for warning in self._summary(scene).get("warnings", ()):
                 print(f"snakesfm: scene '{scene.name}': warning: {warning}", flush=True)
 
@@ -201,7 +199,9 @@ class Run:
         return sentences
 
     def _summary(self, scene: ScenePlan) -> dict[str, Any]:
-        """What export_model says of the scene's model; empty where there is none."""
+        """What export_model says of the scene's model; empty where there is none of the present images."""
+        if self._is_outdated(scene):
+            return {}
         try:
             summary: dict[str, Any] = json.loads(
                 (scene.folder / "export_model" / "summary.json").read_text("utf-8")
@@ -223,10 +223,11 @@ class Run:
     def describe(self, scene: ScenePlan) -> str:
         """How many images are registered, the points, the error, the time, and where the model is."""
         summary = self._summary(scene)
-        if not summary or self._is_outdated(scene):
+        if not summary:
             database = Path(scene.database_file())
             made = f"COLMAP database in {database}, " if database.is_file() else ""
-            model = "the model is of former images: 'all' makes it anew" if summary else "no model yet"
+            former = self._is_outdated(scene)
+            model = "the model is of former images: 'all' makes it anew" if former else "no model yet"
             return f"snakesfm: scene '{scene.name}': {made}{model}."
         others = summary.get("images_in_other_models", [])
         more = f" and {sum(others)} in {len(others)} models beside" if others else ""

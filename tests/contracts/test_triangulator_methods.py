@@ -5,9 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from snakesfm.geometry.camera import undistort
 from snakesfm.synthetic.problems import make_problem
 from snakesfm.triangulation.interface import TriangulationLimits, TriangulationProblem
-from snakesfm.triangulation.tracks import triangulator, undistort
+from snakesfm.triangulation.tracks import triangulator
 
 LIMITS = TriangulationLimits(max_reprojection_error_px=4.0, min_angle_deg=1.0)
 

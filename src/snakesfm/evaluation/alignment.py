@@ -6,12 +6,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from snakesfm.evaluation.pose_errors import compared_images
 from snakesfm.geometry.robust import robust_sigma
 
 Array = NDArray[Any]
 ITERATIONS = 100
 TOLERANCE = 1e-12
-MOST_BASELINES = 200_000
+MOST_PAIRS = 400_000
 
 
 @dataclass(frozen=True)
@@ -57,14 +58,8 @@ def median_rotation(rotations: Array) -> Array:
 
 def _median_scale_translation(points: Array, reference: Array) -> tuple[float, Array]:
     """Scale and translation between rotated centres by medians of distances and of offsets."""
-    count = len(points)
-    if count * (count - 1) // 2 <= MOST_BASELINES:
-        first, second = np.triu_indices(count, 1)
-    else:
-        # to each camera that so many rows further on, evenly from the next one to half of all
-        steps = np.unique(np.linspace(1, count // 2, max(MOST_BASELINES // count, 1)).astype(np.int64))
-        first = np.tile(np.arange(count), len(steps))
-        second = (first + np.repeat(steps, count)) % count
+    partners = compared_images(len(points), MOST_PAIRS)
+    first, second = np.repeat(np.arange(len(points)), partners.shape[1]), partners.ravel()
     baselines = np.linalg.norm(points[first] - points[second], axis=1)
     reference_baselines = np.linalg.norm(reference[first] - reference[second], axis=1)
     usable = (baselines > 0) & (reference_baselines > 0)

@@ -2,6 +2,7 @@
 
 import shutil
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -29,8 +30,16 @@ def write_undistorted(target: Path, sparse: Path, images: Path, masks: Path | No
     ImageError : an image can no longer be read.
     ConfigError : a mask cannot be used.
     """
-    pycolmap.undistort_images(str(target), str(sparse), str(images), num_threads=threads)
-    _write_others(target / "images", sparse, images, threads)
+    model = pycolmap.Reconstruction(str(sparse))
+    registered = [model.images[image_id] for image_id in model.reg_image_ids()]
+    jpegs = [image.name for image in registered if image.name.lower().endswith(JPEG_SUFFIXES)]
+    # of no names COLMAP takes all
+    names = jpegs or [image.name for image in registered[:1]]
+    pycolmap.undistort_images(str(target), str(sparse), str(images), names, num_threads=threads)
+    with ThreadPoolExecutor(threads) as pool:
+        list(pool.map(partial(_write_other, target / "images", images, model), registered))
+        if masks is not None:
+            list(pool.map(partial(_write_mask, target / "masks", masks, model), registered))
     flat = target / "sparse"
     model = target / "model"
     flat.rename(model)
@@ -39,55 +48,46 @@ def write_undistorted(target: Path, sparse: Path, images: Path, masks: Path | No
     shutil.rmtree(target / "stereo")
     for script in target.glob("run-colmap-*.sh"):
         script.unlink()
-    if masks is not None:
-        _write_masks(target / "masks", sparse, masks, threads)
 
 
-def _write_others(target: Path, sparse: Path, images: Path, threads: int) -> None:
+def _write_other(
+    target: Path, images: Path, model: "pycolmap.Reconstruction", image: "pycolmap.Image"
+) -> None:
     """Write what is no JPEG, whatever its name says, from the pixels that keypoints were found in.
 
     COLMAP reads no WebP, makes 12 bits in a file of 16 dark, and writes some TIFF files as none can read.
     """
+    file = target / image.name
+    if image.name.lower().endswith(JPEG_SUFFIXES) and file.is_file():
+        return
     # most jobs need no more than JPEG
     from PIL import Image
 
     from snakesfm.ingest.read import read_image
 
-    options = pycolmap.UndistortCameraOptions()
-    model = pycolmap.Reconstruction(str(sparse))
-
-    def write(image: "pycolmap.Image") -> None:
-        file = target / image.name
-        if image.name.lower().endswith(JPEG_SUFFIXES) and file.is_file():
-            return
-        pixels = pycolmap.Bitmap.from_array(read_image(images / image.name).rgb)
-        bitmap, _ = pycolmap.undistort_image(options, pixels, model.cameras[image.camera_id])
-        Image.fromarray(bitmap.to_array()).save(file, lossless=True, quality=95)
-
-    with ThreadPoolExecutor(threads) as pool:
-        list(pool.map(write, [model.images[image_id] for image_id in model.reg_image_ids()]))
+    pixels = pycolmap.Bitmap.from_array(read_image(images / image.name).rgb)
+    camera = model.cameras[image.camera_id]
+    bitmap, _ = pycolmap.undistort_image(pycolmap.UndistortCameraOptions(), pixels, camera)
+    file.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(bitmap.to_array()).save(file, lossless=True, quality=95)
 
 
-def _write_masks(target: Path, sparse: Path, masks: Path, threads: int) -> None:
-    """Undistort the masks of the images that have one, as their images are."""
+def _write_mask(
+    target: Path, masks: Path, model: "pycolmap.Reconstruction", image: "pycolmap.Image"
+) -> None:
+    """Undistort the mask of an image that has one, as the image is."""
+    mask = find_mask(masks, image.name)
+    if mask is None:
+        return
     options = pycolmap.UndistortCameraOptions()
     # a mask knows no gray
     nearest = type(options.warp_options.interpolation).NEAREST_NEIGHBOR
     options.warp_options.interpolation = nearest
-    model = pycolmap.Reconstruction(str(sparse))
-
-    def write(image: "pycolmap.Image") -> None:
-        mask = find_mask(masks, image.name)
-        if mask is None:
-            return
-        camera = model.cameras[image.camera_id]
-        size = camera.width, camera.height
-        shown = 255 * read_mask(mask, size).astype(np.uint8)
-        shown = cv2.resize(shown, size, interpolation=cv2.INTER_NEAREST)
-        bitmap, _ = pycolmap.undistort_image(options, pycolmap.Bitmap.from_array(shown), camera)
-        file = target / f"{image.name}.png"
-        file.parent.mkdir(parents=True, exist_ok=True)
-        bitmap.write(str(file))
-
-    with ThreadPoolExecutor(threads) as pool:
-        list(pool.map(write, [model.images[image_id] for image_id in model.reg_image_ids()]))
+    camera = model.cameras[image.camera_id]
+    size = camera.width, camera.height
+    shown = 255 * read_mask(mask, size).astype(np.uint8)
+    shown = cv2.resize(shown, size, interpolation=cv2.INTER_NEAREST)
+    bitmap, _ = pycolmap.undistort_image(options, pycolmap.Bitmap.from_array(shown), camera)
+    file = target / f"{image.name}.png"
+    file.parent.mkdir(parents=True, exist_ok=True)
+    bitmap.write(str(file))

@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from snakesfm.grouping import rows_of_each
+
 if TYPE_CHECKING:
     import pycolmap
 
@@ -116,3 +118,11 @@ def cameras_from_columns(
         )
         for row in range(len(models))
     ]
+
+
+def undistort(cameras: Sequence[Camera], camera_ids: Array, image_ids: Array, keypoints: Array) -> Array:
+    """Points (L,2) on the plane z = 1 of pixels (L,2) of several images."""
+    rays = np.full((len(image_ids), 2), np.nan)
+    for camera, rows in rows_of_each(camera_ids[image_ids]):
+        rays[rows] = cameras[camera].normalize(keypoints[rows])
+    return rays

@@ -159,10 +159,10 @@ def group_images(photographs: Sequence[Photograph], sharing: Sharing) -> list[Ha
         return [_exif_key(p) if p.body else p.name for p in photographs]
     shared, of_one_size = _shared_sizes(photographs), _folders_of_one_size(photographs)
     keys: list[Hashable] = []
-    for photograph, cropped in zip(photographs, find_cropped(photographs), strict=True):
+    for photograph in photographs:
         if photograph.body:
-            whole = is_of_stated_size(photograph.exif, photograph.width, photograph.height)
-            own = cropped and not (whole and photograph.folder not in of_one_size)
+            shape = (photograph.exif, photograph.width, photograph.height)
+            own = photograph.folder in of_one_size or (is_cropped(*shape) and not is_of_stated_size(*shape))
             keys.append(photograph.name if own else _exif_key(photograph))
         elif (photograph.folder, photograph.sides) in shared:
             keys.append((photograph.folder, photograph.width, photograph.height))

@@ -110,7 +110,8 @@ def read_image(path: Path | str, shorter_side_px: int | None = None) -> ImagePix
             deep = _has_deep_colours(image)
             image.load()
             if deep:
-                return _decode_deep_colours(Path(path))
+                rgb = _decode_rgb(Path(path), cv2.IMREAD_COLOR_BGR | cv2.IMREAD_ANYDEPTH)
+                return _from_rgb(_to_8_bit(rgb))
             return _to_pixels(image if turn_back is None else image.transpose(turn_back))
         # PIL raises errors of every type on damaged files, and one bad image must not stop the others
         except Exception as error:
@@ -230,26 +231,22 @@ def _decode_jpeg(path: Path, side: int, shorter_side_px: int | None) -> ImagePix
         4: cv2.IMREAD_REDUCED_COLOR_4,
         8: cv2.IMREAD_REDUCED_COLOR_8,
     }[reduction]
+    return _from_rgb(_decode_rgb(path, flags), reduction)
+
+
+def _decode_rgb(path: Path, flags: int) -> Array:
+    """The stored pixels (H,W,3) by OpenCV, as deep as the flags let them be."""
     data = np.frombuffer(path.read_bytes(), np.uint8)
     bgr = cv2.imdecode(data, flags | cv2.IMREAD_IGNORE_ORIENTATION)
     if bgr is None:
         raise ValueError("it cannot be decoded")
-    rgb = cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB)
-    return ImagePixels(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), rgb, reduction)
+    return np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB))
 
 
 def _has_deep_colours(image: Image.Image) -> bool:
     """Whether PIL would cut opaque colours of 16 bits to their upper 8."""
     opaque = image.mode == "RGB" and not image.has_transparency_data
     return opaque and any(";16" in str(tile[3]) for tile in image.tile)
-
-
-def _decode_deep_colours(path: Path) -> ImagePixels:
-    flags = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
-    bgr = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), flags)
-    if bgr is None:
-        raise ValueError("it cannot be decoded")
-    return _from_rgb(cv2.cvtColor(_to_8_bit(bgr), cv2.COLOR_BGR2RGB))
 
 
 def _to_pixels(image: Image.Image) -> ImagePixels:
@@ -268,8 +265,8 @@ def _from_gray(gray: Array) -> ImagePixels:
     return ImagePixels(gray, cv2.cvtColor(gray, cv2.COLOR_GRAY2RGB))
 
 
-def _from_rgb(rgb: Array) -> ImagePixels:
-    return ImagePixels(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), rgb)
+def _from_rgb(rgb: Array, reduction: int = 1) -> ImagePixels:
+    return ImagePixels(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), rgb, reduction)
 
 
 def _to_8_bit(values: Array) -> Array:

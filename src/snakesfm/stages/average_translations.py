@@ -9,7 +9,7 @@ from snakesfm.artifacts.images import CalibratedCameras, ImageIndex
 from snakesfm.artifacts.mapping import CameraCenters, CameraRotations, TrackTable
 from snakesfm.artifacts.pairs import KINDS, ViewGraph
 from snakesfm.errors import SceneError
-from snakesfm.geometry.camera import cameras_from_columns
+from snakesfm.geometry.camera import cameras_from_columns, undistort
 from snakesfm.stages.job import StageJob
 from snakesfm.translation_averaging.average import average_components
 from snakesfm.translation_averaging.averagers import (
@@ -25,7 +25,6 @@ from snakesfm.translation_averaging.problem import (
     world_rays,
 )
 from snakesfm.translation_averaging.support import SupportLimits
-from snakesfm.triangulation.tracks import undistort
 
 if TYPE_CHECKING:
     from snakesfm.config.average_translations import AverageTranslationsOptions

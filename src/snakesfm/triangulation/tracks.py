@@ -6,8 +6,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from snakesfm.geometry.camera import Camera
-from snakesfm.grouping import rows_of_each
+from snakesfm.geometry.camera import Camera, undistort
 from snakesfm.triangulation.interface import TriangulationLimits, TriangulationProblem, Triangulator
 
 Array = NDArray[Any]
@@ -70,14 +69,6 @@ def triangulate_tracks(
     short = np.bincount(track_of[kept], minlength=len(points)) < min_length
     points[short] = np.nan
     return points, kept & ~short[track_of]
-
-
-def undistort(cameras: Sequence[Camera], camera_ids: Array, image_ids: Array, keypoints: Array) -> Array:
-    """Points (L,2) on the plane z = 1 of pixels (L,2) of several images."""
-    rays = np.full((len(image_ids), 2), np.nan)
-    for camera, rows in rows_of_each(camera_ids[image_ids]):
-        rays[rows] = cameras[camera].normalize(keypoints[rows])
-    return rays
 
 
 def mean_colors(colors: Array, offsets: Array) -> Array:
