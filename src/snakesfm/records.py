@@ -1,9 +1,12 @@
 """What Snakemake noted of the files that it made."""
 
+import os
 import re
 from base64 import urlsafe_b64encode
 from collections.abc import Iterable
 from pathlib import Path
+
+from snakesfm.errors import ConfigError
 
 RECORDS = Path(".snakemake", "metadata")
 MAKES_NOTHING = re.compile(
@@ -29,6 +32,27 @@ def unrecorded_files(outputs: Iterable[str], records: Path = RECORDS) -> list[Pa
     artifacts = [output for output in outputs if output.endswith(".h5")]
     unknown = [output for output in artifacts if not (records / _record_name(output)).is_file()]
     return [path for path in map(Path, unknown) if path.is_file()]
+
+
+def check_folder(snakefile: str, records: Path = RECORDS) -> None:
+    """Make sure that Snakemake can keep its records, without which it ends in a traceback.
+
+    Parameters
+    ----------
+    snakefile : path of the Snakefile, to start it from elsewhere.
+    records : Snakemake's folder of records.
+
+    Raises
+    ------
+    ConfigError : the folder that Snakemake was started in cannot be written.
+    """
+    place = next(folder for folder in (records.parent, Path()) if folder.is_dir())
+    if not os.access(place, os.W_OK, effective_ids=True):
+        raise ConfigError(
+            f"Snakemake keeps its records in '.snakemake' of the folder that it is started in, and "
+            f"{place.resolve()} cannot be written: start it elsewhere with -s {snakefile}, "
+            "or say --directory DIR."
+        )
 
 
 def makes_nothing(arguments: Iterable[str]) -> bool:

@@ -1,11 +1,49 @@
 """Which outputs Snakemake has a record of."""
 
+import os
 from base64 import urlsafe_b64encode
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 
-from snakesfm.records import makes_nothing, unrecorded_files
+from snakesfm.errors import ConfigError
+from snakesfm.records import check_folder, makes_nothing, unrecorded_files
+
+NOBODY = 65534
+
+
+@contextmanager
+def without_root() -> Iterator[None]:
+    """As a user whom permissions of files concern."""
+    user = os.geteuid()
+    if user == 0:
+        os.seteuid(NOBODY)
+    try:
+        yield
+    finally:
+        if user == 0:
+            os.seteuid(0)
+
+
+def test_a_folder_without_room_for_records_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    check_folder("/opt/snakesfm/Snakefile")
+    tmp_path.chmod(0o555)
+    with without_root(), pytest.raises(ConfigError) as refused:
+        check_folder("/opt/snakesfm/Snakefile")
+    assert str(tmp_path) in str(refused.value)
+    assert "-s /opt/snakesfm/Snakefile" in str(refused.value)
+    assert "--directory" in str(refused.value)
+    tmp_path.chmod(0o755)
+    records = tmp_path / ".snakemake"
+    records.mkdir()
+    records.chmod(0o555)
+    with without_root(), pytest.raises(ConfigError, match=r"\.snakemake cannot be written"):
+        check_folder("/opt/snakesfm/Snakefile")
 
 
 def test_files_with_a_record_are_known_however_long_their_names(tmp_path: Path) -> None:

@@ -14,7 +14,7 @@ from snakesfm.blocks import tile_names
 from snakesfm.config.configuration import check_spelling
 from snakesfm.job_server import JobServer
 from snakesfm.plan import Plan
-from snakesfm.records import makes_nothing
+from snakesfm.records import check_folder, makes_nothing
 from snakesfm.run import Run
 
 
@@ -28,6 +28,8 @@ def refusal(error):
 try:
     # Snakemake knows its targets only later, and this one needs no images
     asked = {argument.split(":")[0] for argument in sys.argv[1:]}
+    if workflow.is_main_process:
+        check_folder(workflow.main_snakefile)
     check_spelling(config, sys.argv[1:])
     PLAN = Plan(config, weights_only="fetch_weights" in asked)
     RUN = Run(PLAN)

@@ -1,6 +1,6 @@
 """Bundle adjustment of centres and landmarks with known rotations, on the angles of the rays."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -16,6 +16,12 @@ DIRECT_CAMERAS = 300
 """Cameras up to which the reduced system is factored; the factor of a larger one grows faster than it."""
 
 CG_TOLERANCE = 1e-4
+
+RAYS_PER_LANDMARK = 64
+"""Rays beyond which a landmark is cut: the blocks that it fills grow with their square."""
+
+PAIRS_AT_ONCE = 1_000_000
+"""""Products of two rays of one landmark that are held at once."""
 
 
 @dataclass(frozen=True)
@@ -42,7 +48,8 @@ def refine_angles(
     Levenberg-Marquardt with the landmarks eliminated (Schur complement); the residual of a ray is the chord
     between it and the direction to its landmark, under a Cauchy loss whose scale shrinks to ``scale_rad``.
     Images without a first guess stay NaN and their rays and edges are not used. The gauge is left to the
-    damping: the result is in the frame and near the scale of the first guess.
+    damping: the result is in the frame and near the scale of the first guess. A landmark of very many rays is
+    cut into several, each seen from all over, which share its first guess; the first one is returned.
     """
     known = np.isfinite(centers[:, 0])
     problem = problem.select_edges(known[problem.pairs[:, 0]] & known[problem.pairs[:, 1]]).select_rays(
@@ -54,12 +61,13 @@ def refine_angles(
     images = problem.images()
     column = np.full(problem.image_count, -1)
     column[images] = np.arange(len(images))
-    tracks, track_row = np.unique(problem.ray_tracks, return_inverse=True)
+    problem, owners = _cut_landmarks(problem, RAYS_PER_LANDMARK)
+    track_row = problem.ray_tracks
     ends = column[problem.pairs]
     ray_column = column[problem.ray_images]
     structure = _structure(ray_column, track_row, ends)
 
-    place, spots = centers[images].copy(), points[tracks].copy()
+    place, spots = centers[images].copy(), points[owners].copy()
     sigmas = np.maximum(problem.sigmas_rad, scale_rad)
     damping = 1e-4
     state = _linearize(problem, ends, ray_column, track_row, place, spots)
@@ -91,8 +99,20 @@ def refine_angles(
     result = np.full_like(centers, np.nan)
     result[images] = place
     landmarks = np.full((track_count, 3), np.nan)
-    landmarks[tracks] = spots
+    landmarks[owners[::-1]] = spots[::-1]
     return result, landmarks
+
+
+def _cut_landmarks(problem: PositioningProblem, most: int) -> tuple[PositioningProblem, Array]:
+    """The rays by landmarks, numbered from 0, of at most ``most`` rays, and the track (m) of each."""
+    tracks, row, lengths = np.unique(problem.ray_tracks, return_inverse=True, return_counts=True)
+    position = np.arange(len(row)) - (np.cumsum(lengths) - lengths)[row]
+    pieces = -(-lengths // most)
+    # Every n-th ray of a track: neighbouring images would see a landmark from one side.
+    piece = (np.cumsum(pieces) - pieces)[row] + position % pieces[row]
+    order = np.argsort(piece, kind="stable")
+    problem = problem.select_rays(order)
+    return replace(problem, ray_tracks=piece[order]), np.repeat(tracks, pieces)
 
 
 def _linearize(
@@ -194,8 +214,7 @@ def _step(
 
     gain = ray_h @ inverse[track_row]
     reduced_g = camera_g + sum_by(np.einsum("qij,qj->qi", gain, point_g[track_row]), ray_column, cameras)
-    fill = -(gain[structure.first] @ ray_h[structure.second])
-    blocks = sum_by(np.concatenate([fill, -edge_h, camera_h]), structure.groups, len(structure.rows))
+    blocks = _blocks(structure, gain, ray_h, edge_h, camera_h)
     off = structure.rows != structure.columns
     blocks = np.concatenate([blocks, blocks[off].transpose(0, 2, 1)])
     row = np.concatenate([structure.rows, structure.columns[off]])
@@ -208,6 +227,21 @@ def _step(
     pull = sum_by(np.einsum("qij,qj->qi", ray_h, delta[ray_column]), track_row, landmarks)
     move = np.einsum("pij,pj->pi", inverse, point_g + pull)
     return delta, move
+
+
+def _blocks(structure: _Structure, gain: Array, ray_h: Array, edge_h: Array, camera_h: Array) -> Array:
+    """Upper blocks (B,3,3) of the reduced camera system."""
+    pairs = len(structure.first)
+    blocks = np.zeros((len(structure.rows), 3, 3))
+    for start in range(0, pairs, PAIRS_AT_ONCE):
+        part = slice(start, min(start + PAIRS_AT_ONCE, pairs))
+        products = gain[structure.first[part]] @ ray_h[structure.second[part]]
+        blocks -= sum_by(products, structure.groups[part], len(blocks))
+    edges = structure.groups[pairs : pairs + len(edge_h)]
+    # a pair of images has one edge, so no place is met twice
+    blocks[edges] -= edge_h
+    blocks[structure.groups[pairs + len(edge_h) :]] += camera_h
+    return blocks
 
 
 def solve_blocks(matrix: Any, right: Array, direct_up_to: int = DIRECT_CAMERAS) -> Array:

@@ -186,6 +186,34 @@ def test_refinement_improves_a_disturbed_start_and_keeps_missing_cameras():
     assert points.shape == (problem.ray_tracks.max() + 1, 3)
 
 
+def test_landmarks_of_very_many_rays_are_cut_and_say_the_same(monkeypatch):
+    rng = np.random.default_rng(5)
+    cameras, landmarks = 90, 30
+    centers = rng.normal(size=(cameras, 3))
+    points = rng.normal(size=(landmarks, 3)) * 0.5 + [0.0, 0.0, 6.0]
+    images, tracks = np.tile(np.arange(cameras), landmarks), np.repeat(np.arange(landmarks), cameras)
+    rays = points[tracks] - centers[images] + rng.normal(0, 1e-3, (len(images), 3))
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    pairs = np.array([(i, j) for i in range(cameras) for j in range(i + 1, min(cameras, i + 6))])
+    directions = centers[pairs[:, 1]] - centers[pairs[:, 0]]
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    problem = PositioningProblem(
+        cameras, pairs, directions, np.full(len(pairs), 0.01), images, tracks, rays
+    )
+    start = centers + rng.normal(0, 0.05, centers.shape)
+    cut, spots = refine_angles(problem, start, 1e-3)
+    monkeypatch.setattr("snakesfm.translation_averaging.angular.RAYS_PER_LANDMARK", cameras)
+    whole, _ = refine_angles(problem, start, 1e-3)
+    monkeypatch.setattr("snakesfm.translation_averaging.angular.PAIRS_AT_ONCE", 1000)
+    pieces, _ = refine_angles(problem, start, 1e-3)
+    np.testing.assert_allclose(pieces, whole, atol=1e-9)
+    assert not np.array_equal(cut, whole)
+    assert errors(cut, centers).mean() < 1.3 * errors(whole, centers).mean()
+    assert errors(cut, centers).mean() < 0.2 * errors(start, centers).mean()
+    assert np.isfinite(spots).all()
+    assert len(spots) == landmarks
+
+
 def test_mfas_weighs_wrong_directions_more():
     truth = make_problem(30, 3000, "area", pair_outlier_ratio=0.15, seed=3)
     weights = mfas_weights(positioning(truth), 60, 0)
