@@ -7,11 +7,11 @@ the command loads the libraries itself.
 """
 
 import contextlib
-import fcntl
 import importlib
 import os
 import pkgutil
 import select
+import shutil
 import signal
 import socket
 import subprocess
@@ -23,7 +23,7 @@ from pathlib import Path
 
 from snakesfm import stages
 from snakesfm.job import limit_library_threads, run_job
-from snakesfm.start import VARIABLE
+from snakesfm.start import RUN_PIPE, VARIABLE, end_with, end_with_run
 
 LARGEST_REQUEST = 1 << 20
 # stages import these only where they need them
@@ -42,6 +42,7 @@ class JobServer:
 
     def __init__(self) -> None:
         self.process: subprocess.Popen[bytes] | None = None
+        self.pipe: int | None = None
 
     def start(self, variables: Mapping[str, str]) -> None:
         """Start the server and have the jobs of this process ask it.
@@ -57,7 +58,9 @@ class JobServer:
             return
         with contextlib.suppress(OSError):
             # a folder that nobody else can enter
-            address = str(Path(tempfile.mkdtemp(prefix="snakesfm-")) / "jobs")
+            folder = Path(tempfile.mkdtemp(prefix="snakesfm-"))
+            address = str(folder / "jobs")
+            self.pipe = _hold_open(folder / RUN_PIPE)
             # this end of the pipe stays open until this process ends, however it ends
             self.process = subprocess.Popen(
                 [sys.executable, "-P", "-m", "snakesfm.job_server", address],
@@ -74,12 +77,22 @@ class JobServer:
             self.process.communicate()
 
 
+def _hold_open(path: Path) -> int:
+    """Make a named pipe, and open the end that is written to."""
+    os.mkfifo(path)
+    # to open it for writing alone would wait for a reader
+    reader = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
+    writer = os.open(path, os.O_WRONLY)
+    os.close(reader)
+    return writer
+
+
 def serve(address: str) -> None:
     """Load the libraries, then fork a job for each process that asks, until standard input ends.
 
     Parameters
     ----------
-    address : path of the socket, in a folder of its own; both are removed in the end.
+    address : path of the socket, in a folder of the run; both are removed in the end.
     """
     # an interrupt from the terminal is for the jobs, also for one that is just being forked
     signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
@@ -97,8 +110,7 @@ def serve(address: str) -> None:
                         _become_job(connection)
             _forget_ended_jobs()
     finally:
-        Path(address).unlink(missing_ok=True)
-        Path(address).parent.rmdir()
+        shutil.rmtree(Path(address).parent, ignore_errors=True)
     # to take the libraries down would keep the run waiting for a tenth of a second
     os._exit(0)
 
@@ -123,7 +135,7 @@ def _become_job(connection: socket.socket) -> None:
     status = 1
     try:
         request, streams, _, _ = socket.recv_fds(connection, LARGEST_REQUEST, 3)
-        _end_with(connection)
+        end_with(connection.fileno())
         signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
         for target, stream in enumerate(streams):
             os.dup2(stream, target)
@@ -133,6 +145,7 @@ def _become_job(connection: socket.socket) -> None:
         for variable in variables:
             name, _, value = variable.partition(b"=")
             os.environb[name] = value
+        end_with_run()
         run_job(stage.decode())
         status = 0
     except KeyboardInterrupt:
@@ -146,15 +159,6 @@ def _become_job(connection: socket.socket) -> None:
             connection.send(str(status).encode())
         # nothing of the server is cleaned up by a fork of it
         os._exit(status)
-
-
-def _end_with(connection: socket.socket) -> None:
-    """Have the system end this process, by SIGIO, when the one that waits for it is gone."""
-    fcntl.fcntl(connection, fcntl.F_SETOWN, os.getpid())
-    fcntl.fcntl(connection, fcntl.F_SETFL, os.O_RDWR | os.O_ASYNC | os.O_NONBLOCK)
-    with contextlib.suppress(BlockingIOError):
-        if not connection.recv(1):
-            os._exit(1)
 
 
 if __name__ == "__main__":

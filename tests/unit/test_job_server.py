@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from snakesfm.job_server import JobServer
-from snakesfm.start import NO_SERVER, VARIABLE
+from snakesfm.start import NO_SERVER, RUN_PIPE, VARIABLE
 
 Command = subprocess.Popen[str]
 CLIENT = "import sys; from snakesfm.start import fork_job; sys.exit(fork_job(sys.argv[1]) or 0)"
@@ -159,6 +159,41 @@ def test_a_job_ends_with_its_command(parent: Command, ask) -> None:
     # and the server goes on
     again, other = waiting_job(parent, ask)
     assert signal_job(again, other, signal.SIGTERM)[0] == 1
+
+
+def test_jobs_end_with_the_run_though_their_commands_live(
+    parent: Command, address: str, ask: Callable[[str], Command], tmp_path: Path
+) -> None:
+    forked, job = waiting_job(parent, ask)
+    script = Path(__file__).resolve().parents[2] / "scripts" / "index_images.py"
+    no_socket = str(Path(address).parent / "not_ready_yet")
+    alone = subprocess.Popen(
+        [sys.executable, str(script)],
+        stdin=subprocess.PIPE,
+        env={**os.environ, VARIABLE: no_socket},
+        text=True,
+    )
+    pipe = Path(address).parent / RUN_PIPE
+    wait_until(lambda: pipe in [file.readlink() for file in Path(f"/proc/{alone.pid}/fd").iterdir()])
+    parent.kill()
+    wait_until(lambda: has_ended(job))
+    assert forked.wait(timeout=10) == 1
+    alone.communicate(timeout=10)
+    assert alone.returncode == -signal.SIGIO
+    # and one that comes too late
+    Path(no_socket).parent.mkdir(exist_ok=True)
+    if not pipe.exists():
+        os.mkfifo(pipe)
+    late = subprocess.run(
+        [sys.executable, str(script)],
+        input=call_text(tmp_path / "out", tmp_path / "missing"),
+        env={**os.environ, VARIABLE: no_socket},
+        text=True,
+        capture_output=True,
+        timeout=60,
+        check=False,
+    )
+    assert (late.returncode, late.stderr) == (1, "")
 
 
 def test_an_interrupt_ends_jobs_and_not_the_server(parent: Command, ask) -> None:
