@@ -11,6 +11,7 @@ from typing import Any
 UNTOLD = frozenset(
     (
         "images",
+        "images_target",
         "cameras",
         "masks",
         "masks_content",
@@ -36,12 +37,20 @@ def settings_text(settings: Mapping[str, Any], seed: int) -> str:
 
 
 @functools.cache
-def file_digest(path: str) -> str:
-    """SHA-256 of a small file, or of the cameras, images and points files of a folder; '' for no path."""
+def file_digest(path: str, *beside: str) -> str:
+    """SHA-256 of a small file, or of the cameras, images and points files of a folder; '' for no path.
+
+    Parameters
+    ----------
+    path : the file or folder.
+    beside : names of files that count as well where they lie beside a file.
+    """
     if not path:
         return ""
     root = Path(path).expanduser()
-    files = [root] if root.is_file() else sorted(p for p in root.rglob("*") if p.suffix in {".txt", ".bin"})
+    files = sorted(p for p in root.rglob("*") if p.suffix in {".txt", ".bin"})
+    if root.is_file():
+        files = [root, *(other for name in beside if (other := root.with_name(name)).is_file())]
     digest = hashlib.sha256()
     for file in files:
         digest.update(file.name.encode() + b"\0" + file.read_bytes())

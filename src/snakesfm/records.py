@@ -1,5 +1,6 @@
 """What Snakemake noted of the files that it made."""
 
+import json
 import os
 import re
 from base64 import urlsafe_b64encode
@@ -10,28 +11,50 @@ from snakesfm.errors import ConfigError
 
 RECORDS = Path(".snakemake", "metadata")
 MAKES_NOTHING = re.compile(
-    r"-[a-zA-Z]*[nSDlt][a-zA-Z]*|"
+    # behind a letter that takes a value, the rest is that value: '-call' is '--cores all'
+    r"-[hkfFvpa]*[nSDlt].*|"
     r"--(dry-?run|touch|unlock|lint|report|archive|l[tipu]|list.*|summary|detailed-summary|dag|rulegraph|filegraph|"
     r"d3dag|cleanup-.*|delete-.*|containerize|generate-unit-tests|export-cwl|print-compilation)(=.*)?"
 )
 # the longest name of a file, less the mark of a part that goes on
 PART = 254
+# times pass through floating point
+SAME_TIME_S = 1e-3
 
 
 def unrecorded_files(outputs: Iterable[str], records: Path = RECORDS) -> list[Path]:
-    """Artifacts that are there and of which no record tells how they were made.
+    """Files that are there and of which no record tells how they were made.
 
-    Snakemake compares a job's options with those that it noted in the folder it was started in. Of a file
-    that was made from another folder, or whose notes are gone, it takes any for granted.
+    Snakemake compares a job's options with those that it noted in the folder it was started in, under the
+    output's name as it was said. Of a file that was made from another folder or under another name, or
+    whose notes are gone, it takes any for granted; and notes of a file that was made again so are of the
+    former one, whose time they hold.
 
     Parameters
     ----------
     outputs : files as the rules name them.
     records : Snakemake's folder of records.
     """
-    artifacts = [output for output in outputs if output.endswith(".h5")]
-    unknown = [output for output in artifacts if not (records / _record_name(output)).is_file()]
-    return [path for path in map(Path, unknown) if path.is_file()]
+    return [Path(output) for output in outputs if not _is_recorded(output, records)]
+
+
+def forget(output: Path, records: Path = RECORDS) -> None:
+    """Have Snakemake make a file again: it is older than everything, and no record is of it."""
+    (records / _record_name(str(output))).unlink(missing_ok=True)
+    os.utime(output, (0, 0))
+
+
+def _is_recorded(output: str, records: Path) -> bool:
+    """Whether a file is missing, or is the one that its record is of."""
+    try:
+        changed = Path(output).stat().st_mtime
+    except OSError:
+        return True
+    try:
+        record = json.loads((records / _record_name(output)).read_text("utf-8"))
+        return abs(float(record["endtime"]) - changed) < SAME_TIME_S
+    except (OSError, ValueError, KeyError, TypeError):
+        return False
 
 
 def check_folder(snakefile: str, records: Path = RECORDS) -> None:

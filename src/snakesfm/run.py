@@ -15,7 +15,7 @@ from snakesfm import slurm
 from snakesfm.errors import ConfigError
 from snakesfm.job_logs import find_cost
 from snakesfm.plan import Plan
-from snakesfm.records import unrecorded_files
+from snakesfm.records import forget, unrecorded_files
 from snakesfm.scene_plan import ScenePlan
 
 LOCK_NAME = ".snakesfm.lock"
@@ -34,13 +34,19 @@ class Run:
     def refuse_unrecorded(self) -> None:
         """Set aside what other images, options or seeds made and Snakemake knows nothing of.
 
-        Before the jobs are planned, so that they are planned to be made again. While another run writes to
-        the folder nothing is touched: this one will be refused.
+        Before the jobs are planned, so that they are planned to be made again. What does not say of itself
+        how it was made, as a model or a report, is made again and stays until then.
+
+        Raises
+        ------
+        ConfigError : another run is writing to the folder.
         """
-        if self._is_locked():
-            return
+        self._refuse_locked()
         for scene in self.plan.scenes.values():
-            unknown = unrecorded_files(scene.all_files())
+            for path in unrecorded_files(scene.results()):
+                with contextlib.suppress(OSError):
+                    forget(path)
+            unknown = unrecorded_files(scene.artifacts())
             if not unknown:
                 continue
             # loaded here, as most runs know their files and h5py takes a tenth of a second
@@ -54,16 +60,23 @@ class Run:
                     flush=True,
                 )
 
-    def _is_locked(self) -> bool:
-        """Whether another run holds the output folder."""
+    def _refuse_locked(self) -> None:
+        """Refuse to work beside another run; a run without jobs would not come to take the lock."""
+        if not self.plan.scenes:
+            return
+        with contextlib.suppress(OSError), (self.plan.output / LOCK_NAME).open(encoding="utf-8") as lock:
+            self._lock(lock, fcntl.LOCK_SH)
+
+    def _lock(self, lock: Any, how: int) -> None:
+        """Lock the output folder, as far as the file system can, or refuse where another run holds it."""
         try:
-            with (self.plan.output / LOCK_NAME).open(encoding="utf-8") as lock:
-                fcntl.flock(lock, fcntl.LOCK_SH | fcntl.LOCK_NB)
+            fcntl.flock(lock, how | fcntl.LOCK_NB)
         except BlockingIOError:
-            return True
-        except OSError:
-            return False
-        return False
+            lock.seek(0)
+            raise ConfigError(
+                f"Another run ({lock.read().strip() or 'unknown'}) is writing to "
+                f"'{self.plan.output}': wait for it to end, or give another output=DIR."
+            ) from None
 
     def start(self, slurm_run: str = "") -> None:
         """Take the output folder for this run; the system frees it when the run ends, however it ends.
@@ -90,19 +103,19 @@ class Run:
                 "say another with --config output=DIR."
             ) from None
         try:
-            fcntl.flock(self.lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            self.lock.seek(0)
-            raise ConfigError(
-                f"Another run ({self.lock.read().strip() or 'unknown'}) is writing to "
-                f"'{self.plan.output}': wait for it to end, or give another output=DIR."
-            ) from None
+            self._lock(self.lock, fcntl.LOCK_EX)
         except OSError as error:
             print(f"snakesfm: warning: {path} cannot be locked ({error.strerror}); start one run only.")
         self._end_former_jobs()
         self.slurm_run = slurm_run
         jobs = f", SLURM run {slurm_run}" if slurm_run else ""
-        self._note(f"process {os.getpid()} on {os.uname().nodename}{jobs}")
+        try:
+            self._note(f"process {os.getpid()} on {os.uname().nodename}{jobs}")
+        except OSError as error:
+            raise ConfigError(
+                f"The output folder '{self.plan.output}' cannot be written ({error.strerror}): "
+                "free the disk, then run again."
+            ) from None
         self._bring_times_back()
         for scene in self.plan.scenes.values():
             print(
@@ -234,14 +247,23 @@ class Run:
         accuracy = ""
         with contextlib.suppress(OSError, ValueError, KeyError):
             metrics = json.loads((scene.folder / "evaluate_model" / "metrics.json").read_text("utf-8"))
-            areas = [f"{metrics[f'relative_pose_auc_{degrees}deg']:.1f}" for degrees in (1, 3, 5)]
-            accuracy = f", relative-pose AUC {'/'.join(areas)} at 1/3/5 deg"
+            accuracy = _describe_accuracy(metrics)
         return (
             f"snakesfm: scene '{scene.name}': {summary['registered_images']} of {summary['images']} images "
             f"registered{more}, {summary['points']} points, mean reprojection error "
             f"{summary['mean_reprojection_error_px']:.3f} px{accuracy}, "
             f"{time.time() - self.started:.0f} s; model in {scene.folder / 'export_model' / 'sparse' / '0'}"
         )
+
+
+def _describe_accuracy(metrics: dict[str, Any]) -> str:
+    """A clause on how near a model is to its reference."""
+    images, present = metrics["reference_images"], metrics["reference_images_present"]
+    if not present:
+        return ", none of the reference's images is among them by name, so nothing is evaluated"
+    areas = [f"{metrics[f'relative_pose_auc_{degrees}deg']:.1f}" for degrees in (1, 3, 5)]
+    share = f" of the reference's {images} images, {present} of which are here" if present < images else ""
+    return f", relative-pose AUC {'/'.join(areas)} at 1/3/5 deg{share}"
 
 
 def _cancel_timers() -> None:

@@ -82,6 +82,11 @@ def _check_given_files(scene: ScenePlan) -> None:
                 f"'{path}', given as {key}= for scene '{scene.name}', does not exist: "
                 "correct the path or remove the key."
             )
+    if scene.inputs.pairs and not Path(scene.inputs.pairs).expanduser().is_file():
+        raise ConfigError(
+            f"'{scene.inputs.pairs}', given as pairs= for scene '{scene.name}', is no file: "
+            "name the text file with two image names per line."
+        )
 
 
 def _check_masks(scene: ScenePlan) -> None:

@@ -49,6 +49,8 @@ STAGES_IN_DETECTOR_PIXELS = (
     "triangulate_tracks",
     "adjust_bundle",
 )
+IMAGE_LISTS = ("images.txt", "images.bin")
+"""Beside known cameras: which image is of which."""
 STAGES_WITH_NETWORKS = ("extract_features", "describe_images", "match_pairs")
 
 
@@ -273,8 +275,16 @@ class ScenePlan:
         names = ("features.h5", "matches.h5", "pairs.txt")
         return [str(self.folder / "export_hloc" / name) for name in names]
 
+    def results(self) -> list[str]:
+        """What is made for others, and does not say of itself how."""
+        return [*self.final_files(), self.database_file(), *self.hloc_files()]
+
     def all_files(self) -> list[str]:
         """What a run makes of the scene; Snakemake re-makes a lost file only if it is asked for by name."""
+        return self.artifacts() + self.final_files()
+
+    def artifacts(self) -> list[str]:
+        """The artifacts of all stages."""
         files = [str(self.folder / name) for name in SCENE_ARTIFACTS]
         files += self.files(self.features_stage, "blocks")
         for stage in dict.fromkeys(
@@ -283,7 +293,7 @@ class ScenePlan:
             files += self.files(stage, "tiles")
         if self.select_pairs.needs_descriptors:
             files += [*self.vocabulary(), *self.files("describe_images", "blocks")]
-        return files + self.final_files()
+        return files
 
     @functools.cached_property
     def _weights_contents(self) -> dict[str, str]:
@@ -314,7 +324,7 @@ class ScenePlan:
             return {
                 "images": str(self.images),
                 "cameras": inputs.cameras,
-                "cameras_content": file_digest(inputs.cameras),
+                "cameras_content": file_digest(inputs.cameras, *IMAGE_LISTS),
                 "blocks": self.blocks,
                 "content": content,
             }
@@ -344,7 +354,8 @@ class ScenePlan:
             return {"images": str(self.images), "intrinsics": inputs.intrinsics, "camera_model": model}
         if stage == "export_model":
             masks = {"masks": str(self.masks)} if inputs.masks else {}
-            return {"images": str(self.images)} | masks
+            # the model's folder links to what the image folder is, which may be a link that is turned
+            return {"images": str(self.images), "images_target": str(self.images.resolve())} | masks
         if stage == "evaluate_model":
             return {"reference": inputs.reference, "reference_content": file_digest(inputs.reference)}
         return {}

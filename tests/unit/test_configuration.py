@@ -66,6 +66,9 @@ def test_scenes_replace_images_and_both_are_refused() -> None:
     assert listed["b"].intrinsics == "refine"
     with pytest.raises(ConfigError, match="not both"):
         list_scenes(load_configuration({"scenes": scenes, "images": "z"}))
+    for key, value in {"cameras": "K.txt", "intrinsics": "refine", "reference": "r", "pairs": "p"}.items():
+        with pytest.raises(ConfigError, match=f"'{key}' beside 'scenes' .* each scene"):
+            list_scenes(load_configuration({"scenes": scenes, key: value}))
 
 
 @pytest.mark.parametrize("name", ["../up", ".hidden", "a/b"])

@@ -1,5 +1,6 @@
 """Which outputs Snakemake has a record of."""
 
+import json
 import os
 from base64 import urlsafe_b64encode
 from collections.abc import Iterator
@@ -9,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from snakesfm.errors import ConfigError
-from snakesfm.records import check_folder, makes_nothing, unrecorded_files
+from snakesfm.records import check_folder, forget, makes_nothing, unrecorded_files
 
 NOBODY = 65534
 
@@ -46,6 +47,15 @@ def test_a_folder_without_room_for_records_is_named(
         check_folder("/opt/snakesfm/Snakefile")
 
 
+def write_record(records: Path, output: Path, endtime: float) -> list[str]:
+    code = urlsafe_b64encode(str(output).encode()).decode()
+    parts = [code[k : k + 254] for k in range(0, len(code), 254)]
+    record = records.joinpath(*[f"@{part}" for part in parts[:-1]], parts[-1])
+    record.parent.mkdir(parents=True, exist_ok=True)
+    record.write_text(json.dumps({"endtime": endtime}))
+    return parts
+
+
 def test_files_with_a_record_are_known_however_long_their_names(tmp_path: Path) -> None:
     short, long = tmp_path / "a.h5", tmp_path / ("deep" * 50) / ("name" * 40 + ".h5")
     for path in (short, long, tmp_path / "b.h5", tmp_path / "c.json"):
@@ -53,14 +63,30 @@ def test_files_with_a_record_are_known_however_long_their_names(tmp_path: Path) 
         path.touch()
     records = tmp_path / "records"
     for path in (short, long):
-        code = urlsafe_b64encode(str(path).encode()).decode()
-        parts = [code[k : k + 254] for k in range(0, len(code), 254)]
-        record = records.joinpath(*[f"@{part}" for part in parts[:-1]], parts[-1])
-        record.parent.mkdir(parents=True, exist_ok=True)
-        record.touch()
+        parts = write_record(records, path, path.stat().st_mtime)
     assert len(parts) == 3
     outputs = [str(tmp_path / name) for name in ("a.h5", "b.h5", "c.json", "missing.h5")]
-    assert unrecorded_files([*outputs, str(long)], records) == [tmp_path / "b.h5"]
+    assert unrecorded_files([*outputs, str(long)], records) == [tmp_path / "b.h5", tmp_path / "c.json"]
+
+
+def test_a_record_of_the_file_that_was_there_before_is_none(tmp_path: Path) -> None:
+    path, records = tmp_path / "a.h5", tmp_path / "records"
+    path.touch()
+    for seconds in (-3.0, 3.0):
+        write_record(records, path, path.stat().st_mtime + seconds)
+        assert unrecorded_files([str(path)], records) == [path]
+    (records / urlsafe_b64encode(str(path).encode()).decode()).write_text("cut o")
+    assert unrecorded_files([str(path)], records) == [path]
+
+
+def test_a_forgotten_file_stays_and_is_older_than_all_and_unrecorded(tmp_path: Path) -> None:
+    path, records = tmp_path / "summary.json", tmp_path / "records"
+    path.write_text("{}")
+    write_record(records, path, path.stat().st_mtime)
+    assert unrecorded_files([str(path)], records) == []
+    forget(path, records)
+    assert path.stat().st_mtime == 0
+    assert unrecorded_files([str(path)], records) == [path]
 
 
 @pytest.mark.parametrize(
@@ -70,6 +96,10 @@ def test_files_with_a_record_are_known_however_long_their_names(tmp_path: Path) 
         (["-c", "2", "-k", "databases", "--report-after-run"], False),
         (["-j2", "--rerun-incomplete", "--list-untracked"], True),
         (["-np"], True),
+        (["-kFnc2"], True),
+        (["-call"], False),
+        (["-jall", "-k"], False),
+        (["-kcall"], False),
         (["--dryrun", "--cores", "1"], True),
         (["--summary"], True),
         (["-S"], True),

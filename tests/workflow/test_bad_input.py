@@ -48,6 +48,7 @@ def texture(seed: int) -> Image.Image:
         (["images=photos", "output=."], ["its own image folder 'photos'", "scene=NAME"]),
         (["images=100_0042"], ["images=100_0042 for the number 1000042", "images=./100_0042"]),
         (["images=photos", "select_pairs={method: listed}"], ["pairs="]),
+        (["images=photos", "select_pairs={method: listed}", "pairs=empty"], ["empty", "is no file"]),
     ],
 )
 def test_a_wrong_call_gives_one_sentence(

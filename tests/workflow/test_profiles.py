@@ -7,6 +7,8 @@ import pytest
 import yaml
 from workflow_runner import Workflow
 
+from snakesfm.scene_plan import STAGES_WITH_NETWORKS
+
 pytestmark = pytest.mark.workflow
 
 CLUSTERS = ("slurm", "slurm-gpu", "kubernetes")
@@ -16,9 +18,14 @@ def read_profile(root: Path, name: str) -> dict:
     return yaml.safe_load((root / "profiles" / name / "profile.yaml").read_text())
 
 
+def test_kubernetes_knows_whose_gpus_the_networks_want(root: Path) -> None:
+    wanted = read_profile(root, "kubernetes")["set-resources"]
+    assert wanted == {stage: {"gpu_manufacturer": "nvidia"} for stage in STAGES_WITH_NETWORKS}
+
+
 def test_slurm_is_slurm_gpu_without_gpus(root: Path) -> None:
     plain, gpu = read_profile(root, "slurm"), read_profile(root, "slurm-gpu")
-    assert plain.pop("set-resources") == {"extract_features": {"gpu": 0}, "match_pairs": {"gpu": 0}}
+    assert plain.pop("set-resources") == {stage: {"gpu": 0} for stage in STAGES_WITH_NETWORKS}
     assert gpu == plain
 
 

@@ -9,7 +9,8 @@ import dataclasses
 import json
 import os
 import tempfile
-from collections.abc import Mapping
+import zlib
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Self
@@ -112,6 +113,9 @@ class Artifact:
             file.attrs["options"] = header.options
             file.attrs["settings"] = header.settings
             file.attrs["software"] = f"snakesfm {snakesfm.__version__}"
+            file.attrs["checksum"] = checksum(
+                getattr(self, field.name) for field in dataclasses.fields(self)
+            )
             for field in dataclasses.fields(self):
                 value = getattr(self, field.name)
                 if field.metadata["dtype"] == "str":
@@ -128,18 +132,15 @@ class Artifact:
         ArtifactError : the file is missing, damaged, of another kind or of another version.
         """
         with cls.open(path) as file:
-            values = {}
-            for field in dataclasses.fields(cls):
-                if field.name not in file:
-                    raise ArtifactError(
-                        f"{path} lacks the dataset '{field.name}': delete the file and run again."
-                    )
-                dataset = file[field.name]
-                if field.metadata["dtype"] == "str":
-                    values[field.name] = dataset.asstr()[()]
-                else:
-                    values[field.name] = dataset[()]
-        return cls(**values)
+            try:
+                made = file.attrs.get("checksum")
+                values = {field.name: _read_column(file, field) for field in dataclasses.fields(cls)}
+                if made is None or made == checksum(values.values()):
+                    return cls(**values)
+            # what h5py raises on damage has no common kind
+            except (KeyError, OSError, RuntimeError, ValueError, TypeError):
+                pass
+        raise ArtifactError(f"{path} is damaged: delete it and run snakemake again.")
 
     @classmethod
     def read_former(cls, path: Path | None) -> Self | None:
@@ -173,6 +174,22 @@ class Artifact:
                 f"{cls.format_version} is needed: delete it and run snakemake again."
             )
         return file
+
+
+def _read_column(file: h5py.File, field: "dataclasses.Field[Any]") -> Array:
+    dataset = file[field.name]
+    return np.asarray(dataset.asstr()[()] if field.metadata["dtype"] == "str" else dataset[()])
+
+
+def checksum(columns: Iterable[Array]) -> int:
+    """CRC-32 of the content of arrays, strings among them, to tell damage by."""
+    total = 0
+    for column in columns:
+        if column.dtype == object:
+            total = zlib.crc32("\0".join(column.ravel()).encode(), total)
+        else:
+            total = zlib.crc32(np.ascontiguousarray(column).reshape(-1).view(np.uint8), total)
+    return total
 
 
 def read_header(path: Path | str) -> Mapping[str, Any]:

@@ -11,6 +11,7 @@ class ImageIndex(Artifact):
     """The images of a scene, in the order of their names, and the cameras that took them."""
 
     kind: ClassVar[str] = "image_index"
+    format_version: ClassVar[int] = 2
 
     names: Array = column("(N)", "str", "POSIX path relative to the image folder, sorted")
     sizes: Array = column("(N,2)", "int32", "width and height in pixels as stored in the file")
@@ -25,7 +26,7 @@ class ImageIndex(Artifact):
     duplicate_of: Array = column("(N)", "int32", "first image with the same bytes, -1 if none")
     camera_models: Array = column("(C)", "str", "COLMAP camera model name")
     camera_sizes: Array = column("(C,2)", "int32", "width and height in pixels")
-    camera_params: Array = column("(C,12)", "float64", "COLMAP parameters in pixels, padded with NaN")
+    camera_params: Array = column("(C,16)", "float64", "COLMAP parameters in pixels, padded with NaN")
     camera_sources: Array = column("(C)", "str", "where the focal length is from: given, exif, default")
     refused_names: Array = column("(R)", "str", "files that look like images but cannot be used")
     refused_reasons: Array = column("(R)", "str", "one sentence per refused file")
@@ -36,10 +37,11 @@ class CalibratedCameras(Artifact):
     """Intrinsics of every camera of the index, before bundle adjustment."""
 
     kind: ClassVar[str] = "calibrated_cameras"
+    format_version: ClassVar[int] = 2
 
     models: Array = column("(C)", "str", "COLMAP camera model name")
     sizes: Array = column("(C,2)", "int32", "width and height in pixels")
-    params: Array = column("(C,12)", "float64", "COLMAP parameters in pixels, padded with NaN")
+    params: Array = column("(C,16)", "float64", "COLMAP parameters in pixels, padded with NaN")
     sources: Array = column("(C)", "str", "where the focal length is from: given, exif, estimated, default")
     focal_sigma: Array = column("(C)", "float64", "relative standard deviation of the focal, NaN unknown")
     pair_counts: Array = column("(C)", "int32", "pairs whose fundamental matrix voted on the focal")

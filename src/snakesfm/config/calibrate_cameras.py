@@ -10,7 +10,7 @@ from snakesfm.config.base import StageOptions
 class CalibrateCamerasOptions(StageOptions):
     """How unknown focal lengths are estimated before any pose is known."""
 
-    stage_version: ClassVar[int] = 4
+    stage_version: ClassVar[int] = 5
 
     estimate_focals: bool = True
     """Estimate focal lengths that are not given from fundamental matrices; otherwise priors are kept."""

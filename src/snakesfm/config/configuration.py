@@ -247,6 +247,17 @@ def scene_name(images: str) -> str:
     return folder.parent.name if folder.name.lower() == "images" else folder.name
 
 
+def _refuse_beside_scenes(configuration: RunOptions) -> None:
+    for key in (*SceneInputs.model_fields, "scene"):
+        if getattr(configuration, key) == RunOptions.model_fields[key].default:
+            continue
+        if key in ("images", "scene"):
+            raise ConfigError(f"Give either '{key}' or 'scenes', not both: remove one of the two keys.")
+        raise ConfigError(
+            f"'{key}' beside 'scenes' belongs to none of them: write it into each scene that it is for."
+        )
+
+
 def list_scenes(configuration: RunOptions) -> dict[str, SceneInputs]:
     """The scenes of a run, by name.
 
@@ -258,8 +269,8 @@ def list_scenes(configuration: RunOptions) -> dict[str, SceneInputs]:
     if not scenes:
         inputs = {key: getattr(configuration, key) for key in SceneInputs.model_fields}
         scenes = {configuration.scene or scene_name(configuration.images): SceneInputs(**inputs)}
-    elif configuration.images != RunOptions.model_fields["images"].default:
-        raise ConfigError("Give either 'images' or 'scenes', not both: remove one of the two keys.")
+    else:
+        _refuse_beside_scenes(configuration)
     if re.search("[{}]", configuration.output):
         raise ConfigError(
             f"The output folder '{configuration.output}' holds braces: give another output=DIR."

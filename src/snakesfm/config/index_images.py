@@ -10,7 +10,7 @@ from snakesfm.config.base import StageOptions
 class IndexImagesOptions(StageOptions):
     """How cameras are told from the images."""
 
-    stage_version: ClassVar[int] = 3
+    stage_version: ClassVar[int] = 4
 
     camera_sharing: Literal["auto", "exif", "single", "per_folder", "per_image"] = "auto"
     """Which images share a camera: alike in EXIF or, without it, in folder and size, or a fixed rule."""

@@ -34,22 +34,8 @@ def main(arguments: list[str] | None = None) -> int:
         **evaluation.metrics,
     }
     if options.per_image:
-        columns = zip(
-            evaluation.names,
-            evaluation.rotation_deg.tolist(),
-            evaluation.position.tolist(),
-            evaluation.direction_deg.tolist(),
-            strict=True,
-        )
-        content["per_image"] = {
-            name: {
-                "rotation_error_deg": rotation,
-                "position_error": position,
-                "translation_angle_deg": angle,
-            }
-            for name, rotation, position, angle in columns
-        }
-    sys.stdout.write(json.dumps(content, indent=1) + "\n")
+        content["per_image"] = evaluation.per_image()
+    sys.stdout.write(json.dumps(content, indent=1, allow_nan=False) + "\n")
     return 0
 
 

@@ -58,26 +58,38 @@ class PoseEvaluation:
     direction_deg: Array = field(default_factory=lambda: np.zeros(0))
     reference_from_model: Similarity | None = None
 
+    def per_image(self) -> dict[str, dict[str, float | None]]:
+        """The errors of every scored image by its name, None where it is not registered."""
+        columns = {
+            "rotation_error_deg": self.rotation_deg.tolist(),
+            "translation_angle_deg": self.direction_deg.tolist(),
+            "position_error": self.position.tolist(),
+        }
+        return {
+            name: {key: None if values[k] != values[k] else values[k] for key, values in columns.items()}
+            for k, name in enumerate(self.names)
+        }
+
 
 def match_names(names: Sequence[str], reference_names: Sequence[str]) -> Array:
     """For each reference image the row of the same image in ``names``, -1 where there is none.
 
     Relative paths decide; where a path is in no other list, the file name alone does if it is unique
-    in both.
+    in both, else without its suffix, as of images that were converted.
     """
     rows = {name: row for row, name in enumerate(names)}
     matched = np.array([rows.get(name, -1) for name in reference_names], dtype=np.int64)
-    taken = set(matched.tolist())
-    by_base: dict[str, list[int]] = {}
-    for row, name in enumerate(names):
-        by_base.setdefault(PurePosixPath(name).name, []).append(row)
-    reference_bases = [PurePosixPath(name).name for name in reference_names]
-    base_counts = Counter(reference_bases)
-    for row in np.flatnonzero(matched < 0).tolist():
-        base = reference_bases[row]
-        candidates = by_base.get(base, [])
-        if len(candidates) == 1 and base_counts[base] == 1 and candidates[0] not in taken:
-            matched[row] = candidates[0]
+    for part in ("name", "stem"):
+        taken = set(matched.tolist())
+        by_part: dict[str, list[int]] = {}
+        for row, name in enumerate(names):
+            by_part.setdefault(getattr(PurePosixPath(name), part), []).append(row)
+        reference_parts = [getattr(PurePosixPath(name), part) for name in reference_names]
+        counts = Counter(reference_parts)
+        for row in np.flatnonzero(matched < 0).tolist():
+            candidates = by_part.get(reference_parts[row], [])
+            if len(candidates) == 1 and counts[reference_parts[row]] == 1 and candidates[0] not in taken:
+                matched[row] = candidates[0]
     return matched
 
 

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     import pycolmap
 
 Array = NDArray[Any]
-PARAM_SLOTS = 12
+PARAM_SLOTS = 16
 ROUND_TRIP_PX = 1.0
 
 
@@ -96,7 +96,7 @@ class Camera:
 
 
 def cameras_to_columns(cameras: Sequence[Camera]) -> tuple[list[str], Array, Array, list[str]]:
-    """Cameras as columns of an artifact: models, sizes (C,2), params (C,12), sources."""
+    """Cameras as columns of an artifact: models, sizes (C,2), params (C,16), sources."""
     params = np.full((len(cameras), PARAM_SLOTS), np.nan)
     for row, camera in enumerate(cameras):
         params[row, : len(camera.params)] = camera.params

@@ -20,11 +20,12 @@ UNREAD_SUFFIXES = (
     *(".avif", ".heic", ".heif", ".jxl"),
     *(".arw", ".cr2", ".cr3", ".dng", ".nef", ".orf", ".raf", ".rw2"),
 )
-CACHE_VERSION = 1
+CACHE_VERSION = 2
 # a file that was written so shortly before may change again within one tick of the file system's clock
 SETTLED_NS = 2_000_000_000
 
-Stamp = tuple[int, int]
+Stamp = tuple[int, int, int]
+"""Size, and times of change of the content and of the file: tools that edit EXIF can keep the first two."""
 
 
 def walk_images(folder: Path | str) -> Iterator[str]:
@@ -103,7 +104,7 @@ def digest_images(
     ----------
     folder : image folder.
     names : paths relative to it.
-    cache_file : JSON file that remembers digests with size and modification time, so that an unchanged file
+    cache_file : JSON file that remembers digests with size and times of change, so that an unchanged file
         is not read again; it is made where it can be, and ignored where it cannot be read or written.
     threads : how many files are read at once; None for as many as there are cores, at most 8.
     """
@@ -122,14 +123,16 @@ def digest_images(
     kept = {
         name: (stamp, digests[name])
         for name, stamp in stamps.items()
-        if stamp is not None and stamp[1] < newest and digests[name]
+        if stamp is not None and max(stamp[1:]) < newest and digests[name]
     }
     if cache_file is not None and kept != known:
         _write_cache(Path(cache_file), str(root), kept)
     return {name: digests[name] for name in names}
 
 
-def _walk(folder: Path, prefix: str, above: frozenset[Stamp], suffixes: tuple[str, ...]) -> Iterator[str]:
+def _walk(
+    folder: Path, prefix: str, above: frozenset[tuple[int, int]], suffixes: tuple[str, ...]
+) -> Iterator[str]:
     try:
         status = folder.stat()
         with os.scandir(folder) as listing:
@@ -165,7 +168,7 @@ def _stamp(path: Path) -> Stamp | None:
         status = path.stat()
     except OSError:
         return None
-    return status.st_size, status.st_mtime_ns
+    return status.st_size, status.st_mtime_ns, status.st_ctime_ns
 
 
 def _digest_files(paths: list[Path], threads: int | None) -> list[str]:
@@ -194,8 +197,8 @@ def _read_cache(cache_file: Path | str | None, root: str) -> dict[str, tuple[Sta
         if content["version"] != CACHE_VERSION or content["folder"] != root:
             return {}
         return {
-            str(name): ((int(size), int(time_ns)), str(digest))
-            for name, (size, time_ns, digest) in content["files"].items()
+            str(name): ((int(size), int(changed_ns), int(touched_ns)), str(digest))
+            for name, (size, changed_ns, touched_ns, digest) in content["files"].items()
         }
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return {}

@@ -3,6 +3,7 @@
 import struct
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import zip_longest
 from pathlib import Path
 
 import numpy as np
@@ -196,9 +197,12 @@ def _image_cameras(path: Path) -> dict[str, int]:
 def _text_image_cameras(text: str) -> Iterator[tuple[str, int]]:
     # every image has two lines, and the second, its points, may be empty
     lines = [line.strip() for line in text.splitlines() if not line.startswith("#")]
-    for line in lines[::2]:
+    for line, points in zip_longest(lines[::2], lines[1::2], fillvalue=""):
         if not line:
             continue
+        # a list without lines of points would lose every second image
+        if len(points.split()) % 3 or (points and not points.split()[-1].lstrip("-").isdigit()):
+            raise ValueError(f"'{points[:60]}' stands where the points of the image before it belong")
         words = line.split(maxsplit=9)
         if len(words) < 10:
             raise ValueError(f"'{line[:60]}' has fewer than 10 words")

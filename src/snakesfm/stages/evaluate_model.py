@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from snakesfm.artifacts import ImageIndex, Reconstruction, atomic_path, write_json
-from snakesfm.evaluation.metrics import PoseEvaluation, Poses, evaluate_poses, model_metrics
+from snakesfm.evaluation.metrics import Poses, evaluate_poses, model_metrics
 from snakesfm.stages.job import StageJob
 
 if TYPE_CHECKING:
@@ -36,23 +36,11 @@ def run(job: StageJob) -> None:
             options.min_baseline_ratio,
         )
         row |= evaluation.metrics
-        content = {**row, "reference": reference, "per_image": _per_image(evaluation)}
+        content = {**row, "reference": reference, "per_image": evaluation.per_image()}
     for path in job.outputs:
         if path.suffix == ".csv":
             _write_csv(path, row)
     write_json(job.output, content)
-
-
-def _per_image(evaluation: PoseEvaluation) -> dict[str, dict[str, float | None]]:
-    columns = {
-        "rotation_error_deg": evaluation.rotation_deg.tolist(),
-        "translation_angle_deg": evaluation.direction_deg.tolist(),
-        "position_error": evaluation.position.tolist(),
-    }
-    return {
-        name: {key: None if values[k] != values[k] else values[k] for key, values in columns.items()}
-        for k, name in enumerate(evaluation.names)
-    }
 
 
 def _write_csv(path: Path, row: dict[str, Any]) -> None:

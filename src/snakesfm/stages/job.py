@@ -1,6 +1,7 @@
 """What a stage gets to work with, wherever it runs."""
 
 import json
+import os
 import sys
 import time
 from collections.abc import Callable, Collection, Mapping, Sequence
@@ -154,7 +155,8 @@ class StageJob:
         wanted = set(digests)
         taken: dict[str, Any] = {}
         for path in (self.former, cached_path(self.stage, digests)):
-            if path is not None and path.is_file() and not wanted <= taken.keys():
+            # unlike a Path, this says no of a folder that may not be entered
+            if path is not None and os.path.isfile(path) and not wanted <= taken.keys():  # noqa: PTH113
                 taken.update(read(path, wanted))
         return taken
 

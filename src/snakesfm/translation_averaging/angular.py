@@ -48,8 +48,8 @@ def refine_angles(
     Levenberg-Marquardt with the landmarks eliminated (Schur complement); the residual of a ray is the chord
     between it and the direction to its landmark, under a Cauchy loss whose scale shrinks to ``scale_rad``.
     Images without a first guess stay NaN and their rays and edges are not used. The gauge is left to the
-    damping: the result is in the frame and near the scale of the first guess. A landmark of very many rays is
-    cut into several, each seen from all over, which share its first guess; the first one is returned.
+    damping: the result is in the frame and near the scale of the first guess. A landmark of very many rays
+    is cut into several, each seen from all over, which share its first guess; the first one is returned.
     """
     known = np.isfinite(centers[:, 0])
     problem = problem.select_edges(known[problem.pairs[:, 0]] & known[problem.pairs[:, 1]]).select_rays(

@@ -15,6 +15,7 @@ from snakesfm.ingest.discover import (
     list_photographs,
 )
 
+SETTLED = "snakesfm.ingest.discover.SETTLED_NS"
 ODD_NAMES = ["a b.jpg", "#1.png", "{x}.JPEG", "dir/a b.jpg", "Ünï/写真.TIF", "z.WebP", "scan.bmp"]
 
 
@@ -70,7 +71,8 @@ def test_missing_folder_is_one_sentence(tmp_path):
         list_images(tmp_path / "nothing")
 
 
-def test_fingerprint_follows_content_not_time(tmp_path):
+def test_fingerprint_follows_content_not_time(tmp_path, monkeypatch):
+    monkeypatch.setattr(SETTLED, 0)
     images, cache = tmp_path / "images", tmp_path / "scene" / "digests.json"
     touch_all(images, ODD_NAMES)
     first = fingerprint_images(images, cache)
@@ -85,24 +87,40 @@ def test_fingerprint_follows_content_not_time(tmp_path):
     assert fingerprint_images(images, cache) not in (first, changed)
 
 
-def test_unchanged_file_is_not_read_again(tmp_path):
+def test_unchanged_file_is_not_read_again(tmp_path, monkeypatch):
+    monkeypatch.setattr(SETTLED, 0)
     touch_all(tmp_path / "i", ["a.jpg"], b"one")
-    stamp = (tmp_path / "i" / "a.jpg").stat()
     cache = tmp_path / "digests.json"
     before = digest_images(tmp_path / "i", ["a.jpg"], cache)
-    # same size and time: only a reader of the content could tell
-    touch_all(tmp_path / "i", ["a.jpg"], b"two")
-    os.utime(tmp_path / "i" / "a.jpg", ns=(stamp.st_atime_ns, stamp.st_mtime_ns))
-    assert digest_images(tmp_path / "i", ["a.jpg"], cache) == before
-    assert digest_images(tmp_path / "i", ["a.jpg"]) != before
+    cache.write_text(cache.read_text().replace(before["a.jpg"], "remembered"))
+    assert digest_images(tmp_path / "i", ["a.jpg"], cache) == {"a.jpg": "remembered"}
 
 
-def test_fresh_file_is_not_remembered(tmp_path):
-    touch_all(tmp_path / "i", ["old.jpg"])
-    touch_all(tmp_path / "i", ["new.jpg"], age_s=0)
+def test_edits_that_keep_size_and_time_are_seen(tmp_path, monkeypatch):
+    monkeypatch.setattr(SETTLED, 0)
+    image = tmp_path / "i" / "a.jpg"
+    touch_all(tmp_path / "i", ["a.jpg"], b"one")
+    kept = image.stat()
     cache = tmp_path / "digests.json"
+    before = digest_images(tmp_path / "i", ["a.jpg"], cache)
+    time.sleep(0.05)
+    # as exiftool -P does
+    image.write_bytes(image.read_bytes().replace(b"one", b"two"))
+    os.utime(image, ns=(kept.st_atime_ns, kept.st_mtime_ns))
+    assert image.stat().st_size == kept.st_size
+    after = digest_images(tmp_path / "i", ["a.jpg"], cache)
+    assert after == digest_images(tmp_path / "i", ["a.jpg"]) != before
+
+
+def test_fresh_file_is_not_remembered(tmp_path, monkeypatch):
+    touch_all(tmp_path / "i", ["a.jpg"])
+    cache = tmp_path / "digests.json"
+    # whose time of change is that of the test, whatever the time of its content
     fingerprint_images(tmp_path / "i", cache)
-    assert list(json.loads(cache.read_text())["files"]) == ["old.jpg"]
+    assert not cache.exists()
+    monkeypatch.setattr(SETTLED, 0)
+    fingerprint_images(tmp_path / "i", cache)
+    assert list(json.loads(cache.read_text())["files"]) == ["a.jpg"]
 
 
 @pytest.mark.parametrize(

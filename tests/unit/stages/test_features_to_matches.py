@@ -22,6 +22,7 @@ from snakesfm.config.learn_vocabulary import LearnVocabularyOptions
 from snakesfm.config.match_pairs import MatchPairsOptions
 from snakesfm.config.select_pairs import SelectPairsOptions
 from snakesfm.errors import ConfigError
+from snakesfm.geometry.camera import PARAM_SLOTS
 from snakesfm.stages import describe_images, extract_features, learn_vocabulary, match_pairs, select_pairs
 from snakesfm.stages.job import StageJob
 
@@ -79,7 +80,7 @@ class Scene:
             duplicate_of=np.full(count, -1),
             camera_models=["PINHOLE"],
             camera_sizes=[[320, 240]],
-            camera_params=np.full((1, 12), np.nan),
+            camera_params=np.full((1, PARAM_SLOTS), np.nan),
             camera_sources=["given"],
             refused_names=["bad.jpg"],
             refused_reasons=["bad.jpg is cut off."],

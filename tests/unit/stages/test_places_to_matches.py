@@ -7,6 +7,7 @@ from snakesfm.artifacts import Header, ImageIndex, LocalFeatures, PairMatches
 from snakesfm.artifacts.pairs import PairCoordinates
 from snakesfm.config.index_matches import IndexMatchesOptions
 from snakesfm.config.merge_keypoints import MergeKeypointsOptions
+from snakesfm.geometry.camera import PARAM_SLOTS
 from snakesfm.stages import index_matches, merge_keypoints
 from snakesfm.stages.job import StageJob
 
@@ -35,7 +36,7 @@ def run(tmp_path):
             gps=np.full((3, 3), np.nan),
             camera_models=[],
             camera_sizes=np.zeros((0, 2), int),
-            camera_params=np.zeros((0, 12)),
+            camera_params=np.zeros((0, PARAM_SLOTS)),
             camera_sources=[],
             refused_names=[],
             refused_reasons=[],

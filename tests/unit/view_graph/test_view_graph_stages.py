@@ -11,6 +11,7 @@ from snakesfm.config.average_rotations import AverageRotationsOptions
 from snakesfm.config.build_view_graph import BuildViewGraphOptions
 from snakesfm.config.filter_view_graph import FilterViewGraphOptions
 from snakesfm.errors import SceneError
+from snakesfm.geometry.camera import PARAM_SLOTS
 from snakesfm.geometry.rotations import angle_of
 from snakesfm.stages import average_rotations, build_view_graph, filter_view_graph
 from snakesfm.stages.job import StageJob
@@ -32,7 +33,7 @@ def write_index(path, header):
         duplicate_of=np.full(IMAGES, -1),
         camera_models=["PINHOLE"],
         camera_sizes=np.array([[640, 480]]),
-        camera_params=np.full((1, 12), np.nan),
+        camera_params=np.full((1, PARAM_SLOTS), np.nan),
         camera_sources=["default"],
         refused_names=[],
         refused_reasons=[],
