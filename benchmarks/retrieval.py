@@ -121,12 +121,13 @@ def measure(image_set: ImageSet, choice: str, run: Run) -> dict[str, Any]:
 
 
 def _likenesses(scene: Path, count: int) -> Array:
-    """How much the largest keypoints of all pairs resemble each other, (N,N); 0 where there are too few."""
+    """How much the largest keypoints of all pairs resemble each other, (N,N)."""
     files = sorted((scene / "extract_features").glob("*.h5"))
-    previews = read_previews(files, count, SelectPairsOptions().preview_keypoints)
+    most = SelectPairsOptions().preview_keypoints
+    previews = read_previews(files, count, most)
     pairs = np.column_stack(np.triu_indices(count, 1))
     values = np.zeros((count, count))
-    values[tuple(pairs.T)] = np.nan_to_num(look_at_pairs(pairs, previews))
+    values[tuple(pairs.T)] = look_at_pairs(pairs, previews, most)
     return values + values.T
 
 

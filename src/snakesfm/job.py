@@ -67,7 +67,7 @@ def run_job(stage: str) -> None:
         _keep_former(job, module)
         _share(job, module)
     except Exception as error:
-        _fail(call, error, terminal)
+        _fail(call, _damage_behind(call, error) or error, terminal)
     ended = time.time()
     cpu_seconds = _processor_seconds() - before
     print(describe_cost(stage, ended, ended - started, cpu_seconds, peak_mb()), flush=True)
@@ -169,6 +169,27 @@ def _share(job: Any, module: Any) -> None:
             cached = cached_path(job.stage, file["digests"].asstr()[()])
         if cached is not None:
             share(job.output, cached)
+
+
+def _damage_behind(call: Call, error: Exception) -> Exception | None:
+    """What an input that cannot be read whole is called, if it may be why a job failed."""
+    from snakesfm.artifacts.checks import check_content
+    from snakesfm.errors import ArtifactError, SnakesfmError
+
+    if isinstance(error, MemoryError) or (
+        isinstance(error, SnakesfmError) and not isinstance(error, ArtifactError)
+    ):
+        return None
+    named = call.files["inputs"].values()
+    paths = [path for value in named for path in ([value] if isinstance(value, str) else value)]
+    try:
+        check_content(map(Path, paths))
+    except ArtifactError as damage:
+        return damage
+    except Exception:
+        # on a full disk, say, where nothing can be renamed
+        return None
+    return None
 
 
 def _fail(call: Call, error: Exception, terminal: Any) -> None:

@@ -41,7 +41,8 @@ def unrecorded_files(outputs: Iterable[str], records: Path = RECORDS) -> list[Pa
 def forget(output: Path, records: Path = RECORDS) -> None:
     """Have Snakemake make a file again: it is older than everything, and no record is of it."""
     (records / _record_name(str(output))).unlink(missing_ok=True)
-    os.utime(output, (0, 0))
+    # Snakemake takes 0 for no time
+    os.utime(output, (1, 1))
 
 
 def _is_recorded(output: str, records: Path) -> bool:

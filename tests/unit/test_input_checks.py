@@ -4,11 +4,12 @@ import shutil
 from collections.abc import Callable
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 
 from snakesfm.artifacts import Header, ImagePairs
-from snakesfm.artifacts.checks import check_inputs, set_aside
+from snakesfm.artifacts.checks import check_content, check_inputs, set_aside
 from snakesfm.digests import options_digest
 from snakesfm.errors import ArtifactError
 
@@ -90,3 +91,19 @@ def test_files_of_other_settings_are_set_aside_unless_they_are_not_told(
     assert path.is_file() == kept
     assert len(refused) == 1 - kept
     assert kept or "another seed" in refused[0]
+
+
+def test_damage_inside_a_file_is_found_and_nothing_else_touched(tmp_path: Path) -> None:
+    good, bad = write_pairs(tmp_path / "0-0.h5"), write_pairs(tmp_path / "0-1.h5")
+    other = tmp_path / "features.h5"
+    with h5py.File(other, "w") as file:
+        file["x"] = [1.0]
+    check_content([good, bad, other, tmp_path / "missing.h5", tmp_path / "x.json"])
+    with h5py.File(bad, "r+") as file:
+        file["likenesses"][0] = 3.0
+    with pytest.raises(ArtifactError, match="is damaged") as caught:
+        check_content([good, bad, other])
+    assert str(bad) in str(caught.value)
+    assert not bad.exists()
+    assert good.is_file()
+    assert other.is_file()

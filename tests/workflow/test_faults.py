@@ -117,6 +117,31 @@ def test_damaged_and_foreign_files_are_found_and_made_again(finished, small_scen
     assert half_written(output) == []
 
 
+def test_a_page_lost_inside_a_file_is_found_by_who_reads_it(finished, small_scene: Path, workflow) -> None:
+    copy_run(finished[0], workflow.folder)
+    output = workflow.folder / "out" / "square"
+    damaged = output / "match_pairs" / "0-1.h5"
+    former = damaged.parent / ".former" / damaged.name
+    former.parent.mkdir(exist_ok=True)
+    former.unlink(missing_ok=True)
+    os.link(damaged, former)
+    times = damaged.stat()
+    with h5py.File(damaged, "r+") as content:
+        content["matches"][...] = 0
+    os.utime(damaged, ns=(times.st_atime_ns, times.st_mtime_ns))
+    for tile in (output / "estimate_two_view").glob("*.h5"):
+        tile.unlink()
+        (tile.parent / ".former" / tile.name).unlink(missing_ok=True)
+    first = workflow.run(*config_of(small_scene))
+    assert first.status != 0
+    assert "Traceback" not in first.text
+    assert "match_pairs/0-1.h5 is damaged" in first.summary[-1]
+    # its former version is the same damaged file
+    second = workflow.run(*config_of(small_scene))
+    assert second.status == 0, second.text
+    assert model_bytes(output) == model_bytes(finished[0])
+
+
 def test_files_from_the_future_and_the_past_change_nothing(finished, small_scene: Path, workflow) -> None:
     """As nodes whose clocks are an hour wrong leave them."""
     copy_run(finished[0], workflow.folder)

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 
+from snakesfm.artifacts import ARTIFACTS
 from snakesfm.artifacts.base import read_header
 from snakesfm.digests import options_digest
 from snakesfm.errors import ArtifactError
@@ -26,12 +27,27 @@ def check_inputs(paths: Iterable[Path], scene: str, digests: Mapping[str, str]) 
     ------
     ArtifactError : at least one file was set aside.
     """
-    refused = set_aside(paths, scene, digests)
-    if refused:
-        more = f" (and {len(refused) - 1} more)" if len(refused) > 1 else ""
-        raise ArtifactError(
-            f"{refused[0]}{more}: it was renamed to *{ASIDE}; start the same command again to make it anew."
-        )
+    _raise_for(set_aside(paths, scene, digests))
+
+
+def check_content(paths: Iterable[Path]) -> None:
+    """Set aside every artifact whose columns are not what was written; for jobs that failed to read one.
+
+    Parameters
+    ----------
+    paths : files to look at, which are read whole; what is no artifact is left alone.
+
+    Raises
+    ------
+    ArtifactError : at least one file was set aside.
+    """
+    kinds = {cls.kind: cls for cls in ARTIFACTS}
+    refused = []
+    for path in paths:
+        cls = kinds.get(str(read_header(path).get("artifact"))) if path.suffix == ".h5" else None
+        if cls is not None and cls.read_former(path) is None:
+            refused.append(_rename(path, "is damaged"))
+    _raise_for(refused)
 
 
 def set_aside(
@@ -56,9 +72,21 @@ def set_aside(
     for path in paths:
         reason = _reason(path, scene, digests, settings) if path.suffix == ".h5" and path.is_file() else ""
         if reason:
-            path.replace(path.with_name(path.name + ASIDE))
-            refused.append(f"{path} {reason}")
+            refused.append(_rename(path, reason))
     return refused
+
+
+def _rename(path: Path, reason: str) -> str:
+    path.replace(path.with_name(path.name + ASIDE))
+    return f"{path} {reason}"
+
+
+def _raise_for(refused: list[str]) -> None:
+    if refused:
+        more = f" (and {len(refused) - 1} more)" if len(refused) > 1 else ""
+        raise ArtifactError(
+            f"{refused[0]}{more}: it was renamed to *{ASIDE}; start the same command again to make it anew."
+        )
 
 
 def _reason(

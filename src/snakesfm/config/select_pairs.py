@@ -15,7 +15,7 @@ SHORTLIST = 100
 class SelectPairsOptions(StageOptions):
     """Which pairs of images are matched."""
 
-    stage_version: ClassVar[int] = 3
+    stage_version: ClassVar[int] = 4
 
     method: Literal[
         "auto",

@@ -17,18 +17,20 @@ from snakesfm.matching.nearest import augmented, pop_two_largest
 
 Array = NDArray[Any]
 
+FEWEST_KEYPOINTS = 50
+"""By which images with few keypoints are looked at."""
 # images that see parts of one view are fewer partners apart
 LOOP_STEPS = 4
 
 
-def largest_keypoints(scales: Array, count: int) -> Array | None:
-    """Rows (count,) of the keypoints (N,) of largest scale, the earlier of equal ones first.
+def largest_keypoints(scales: Array, count: int) -> Array:
+    """Rows (n,) of the keypoints (N,) of largest scale, the earlier of equal ones first.
 
-    None where the image has fewer than twice as many keypoints: then the look would save nothing.
+    ``count`` of them, or half of those of an image that has fewer than twice as many, but no fewer than
+    ``FEWEST_KEYPOINTS`` as far as there are.
     """
-    if len(scales) < 2 * count:
-        return None
-    return np.argsort(-scales, kind="stable")[:count]
+    few = max(len(scales) // 2, FEWEST_KEYPOINTS)
+    return np.argsort(-scales, kind="stable")[: min(count, few)]
 
 
 def likeness(first: Array, second: Array) -> float:
@@ -47,25 +49,27 @@ def likeness(first: Array, second: Array) -> float:
     return float(np.square(1 - ratios, dtype=np.float64).sum())
 
 
-def look_at_pairs(pairs: Array, previews: Sequence[Array | None], threads: int = 1) -> Array:
+def look_at_pairs(pairs: Array, previews: Sequence[Array], count: int, threads: int = 1) -> Array:
     """The likeness of pairs of images.
 
     Parameters
     ----------
     pairs : (P,2) rows of images.
-    previews : descriptors (n,D) of each image's largest keypoints, None where it has too few.
+    previews : descriptors (n,D) of each image's largest keypoints.
+    count : how many keypoints an image that has enough is looked at by; fewer resemble others the less, and
+        their likeness is given as if there were so many.
     threads : how many pairs are looked at at a time; changes nothing in the result.
 
     Returns
     -------
-    (P,) float32, NaN where either image has too few keypoints.
+    (P,) float32, 0 where either image has next to no keypoints.
     """
 
     def look(part: Array) -> list[float]:
         values = []
         for i, j in part.tolist():
-            first, second = previews[i], previews[j]
-            values.append(np.nan if first is None or second is None else likeness(first, second))
+            fewer = min(len(previews[i]), len(previews[j]))
+            values.append(likeness(previews[i], previews[j]) * (count / fewer) if fewer > 1 else 0.0)
         return values
 
     with ThreadPoolExecutor(threads) as pool:
@@ -73,7 +77,9 @@ def look_at_pairs(pairs: Array, previews: Sequence[Array | None], threads: int =
     return np.concatenate([np.asarray(values, np.float32) for values in found])
 
 
-def alike_pairs(pairs: Array, likenesses: Array, min_likeness: float, least_partners: int) -> Array:
+def alike_pairs(
+    pairs: Array, likenesses: Array, unsure: Array, min_likeness: float, least_partners: int
+) -> Array:
     """Which pairs (P,) bool are alike enough, or among the most alike ones of an image.
 
     Where photographs overlap little, the largest keypoints of many neighbours resemble each other as
@@ -82,12 +88,13 @@ def alike_pairs(pairs: Array, likenesses: Array, min_likeness: float, least_part
     Parameters
     ----------
     pairs : (P,2) rows of images, distinct.
-    likenesses : (P,) as :func:`look_at_pairs` has them; a pair without one stays and counts as none.
+    likenesses : (P,) as :func:`look_at_pairs` has them.
+    unsure : (P,) bool, pairs that were looked at by too few keypoints to tell strangers by; they stay.
     min_likeness : what is enough.
     least_partners : of each image so many stay however little they resemble it.
     """
-    stays = ~(likenesses < min_likeness)
-    rows, _, ranks, _ = _ranked(pairs, likenesses, np.flatnonzero(~np.isnan(likenesses)))
+    stays = (likenesses >= min_likeness) | unsure
+    rows, _, ranks, _ = _ranked(pairs, likenesses, np.arange(len(pairs)))
     stays[rows[ranks < least_partners]] = True
     return stays
 
@@ -104,7 +111,7 @@ def choose_partners(pairs: Array, likenesses: Array, enough_partners: int, enoug
     Parameters
     ----------
     pairs : (P,2) rows of images, distinct.
-    likenesses : (P,) as :func:`look_at_pairs` has them; a pair without one stays and counts as none.
+    likenesses : (P,) as :func:`look_at_pairs` has them.
     enough_partners : how many partners an image keeps.
     enough_likeness : it keeps more until the likeness of those kept sums to this.
 
@@ -112,8 +119,8 @@ def choose_partners(pairs: Array, likenesses: Array, enough_partners: int, enoug
     -------
     (P,) bool.
     """
-    stays = np.isnan(likenesses)
-    rows, images, ranks, values = _ranked(pairs, likenesses, np.flatnonzero(~stays))
+    stays = np.zeros(len(pairs), dtype=bool)
+    rows, images, ranks, values = _ranked(pairs, likenesses, np.arange(len(pairs)))
     order = np.lexsort((_turns(ranks, enough_partners), images))
     places = _ranks_within(images, order)
     sums = np.cumsum(values[order]) - values[order]

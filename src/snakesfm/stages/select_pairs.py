@@ -67,32 +67,38 @@ def run(job: StageJob) -> None:
 def _look(
     job: StageJob, table: PairTable, images: int, options: "SelectPairsOptions"
 ) -> tuple[Array, Array]:
-    """The likeness (P,) of pairs, NaN where an image has too few keypoints, and which stay (P,) bool."""
+    """The likeness (P,) of pairs, and which stay (P,) bool."""
     previews = read_previews(job.paths("features"), images, options.preview_keypoints)
     likenesses = np.full(len(table.pairs), np.nan, np.float32)
     progress = job.progress(len(likenesses), "pairs looked at")
     for start in range(0, len(likenesses), LOOKS_AT_ONCE):
         part = slice(start, start + LOOKS_AT_ONCE)
-        likenesses[part] = look_at_pairs(table.pairs[part], previews, job.threads)
+        likenesses[part] = look_at_pairs(
+            table.pairs[part], previews, options.preview_keypoints, job.threads
+        )
         progress.step(len(likenesses[part]))
-    stays = alike_pairs(table.pairs, likenesses, options.min_likeness, options.least_partners)
+    counts = np.array([len(preview) for preview in previews])
+    few = counts < options.preview_keypoints
+    if few.any():
+        print(f"{few.sum()} images have fewer than {2 * options.preview_keypoints} keypoints to look at")
+    unsure = few[table.pairs].any(axis=1) & (counts[table.pairs] > 1).all(axis=1)
+    stays = alike_pairs(table.pairs, likenesses, unsure, options.min_likeness, options.least_partners)
     if options.enough_partners:
         rows, enough = np.flatnonzero(stays), (options.enough_partners, options.enough_likeness)
         stays[rows] = choose_partners(table.pairs[rows], likenesses[rows], *enough)
     return likenesses, stays
 
 
-def read_previews(paths: list[Path], images: int, count: int) -> list[Array | None]:
-    """Descriptors (count,D) of the largest keypoints of every image of the index, None where too few."""
-    previews: list[Array | None] = [None] * images
+def read_previews(paths: list[Path], images: int, count: int) -> list[Array]:
+    """Descriptors (n,D) of the largest keypoints of every image of the index, see largest_keypoints."""
+    previews: list[Array] = [np.zeros((0, 1), np.uint8)] * images
     for path in paths:
         with LocalFeatures.open(path) as file:
             scales, descriptors = file["scales"][()], file["descriptors"]
             offsets = file["offsets"][()].tolist()
             for row, image in enumerate(file["image_ids"][()].tolist()):
                 part = slice(offsets[row], offsets[row + 1])
-                largest = largest_keypoints(scales[part], count)
-                previews[image] = None if largest is None else descriptors[part][largest]
+                previews[image] = descriptors[part][largest_keypoints(scales[part], count)]
     return previews
 
 

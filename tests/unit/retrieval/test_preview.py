@@ -43,11 +43,13 @@ def preview(points, count):
     return points.descriptors[largest_keypoints(points.scales, count)]
 
 
-def test_the_largest_are_chosen_and_few_keypoints_are_not_looked_at():
-    scales = np.random.default_rng(0).permutation(60).astype(np.float32)
-    np.testing.assert_array_equal(largest_keypoints(scales, 20), np.argsort(scales)[::-1][:20])
-    assert largest_keypoints(scales, 31) is None
-    assert largest_keypoints(scales, 30) is not None
+@pytest.mark.parametrize(
+    ("keypoints", "count", "taken"),
+    [(600, 200, 200), (600, 300, 300), (600, 400, 300), (120, 400, 60), (60, 400, 50), (9, 400, 9)],
+)
+def test_the_largest_are_chosen_and_of_few_keypoints_half(keypoints, count, taken):
+    scales = np.random.default_rng(0).permutation(keypoints).astype(np.float32)
+    np.testing.assert_array_equal(largest_keypoints(scales, count), np.argsort(scales)[::-1][:taken])
 
 
 def test_equal_scales_are_taken_from_the_front():
@@ -79,24 +81,33 @@ def test_likeness_is_the_same_in_both_directions_for_strangers_and_relatives():
 @pytest.mark.parametrize("threads", [1, 2, 3])
 def test_pairs_are_looked_at_one_by_one_whatever_the_threads(threads):
     previews = [rootsift(histograms(40, seed)) for seed in (1, 2, 1)]
-    previews.insert(1, None)
-    pairs = np.array([[0, 1], [0, 2], [0, 3], [2, 3]])
-    looked = look_at_pairs(pairs, previews, threads)
-    assert looked.dtype == np.float32 and np.isnan(looked).tolist() == [True, False, False, False]
-    expected = [likeness(previews[i], previews[j]) for i, j in pairs[1:].tolist()]
-    np.testing.assert_allclose(looked[1:], expected, rtol=1e-6)
+    previews.insert(1, previews[0][:1])
+    previews.append(previews[0][:20])
+    pairs = np.array([[0, 1], [0, 2], [0, 3], [2, 3], [3, 4]])
+    looked = look_at_pairs(pairs, previews, 40, threads)
+    assert looked.dtype == np.float32 and looked[0] == 0
+    expected = [likeness(previews[i], previews[j]) for i, j in pairs[1:4].tolist()]
+    np.testing.assert_allclose(looked[1:4], expected, rtol=1e-6)
     assert looked[2] == pytest.approx(40.0) and looked[1] < 10
-    assert look_at_pairs(np.zeros((0, 2), int), previews, threads).shape == (0,)
+    # as if there were as many as elsewhere
+    assert looked[4] == pytest.approx(40.0)
+    assert look_at_pairs(np.zeros((0, 2), int), previews, 40, threads).shape == (0,)
+
+
+def test_strangers_with_few_keypoints_resemble_each_other_no_more_than_others():
+    first, second = (image(histograms(5000, seed)) for seed in (1, 2))
+    for keypoints in (200, 400, 800):
+        few = first.take(np.arange(keypoints))
+        previews = [preview(few, 400), preview(second, 400)]
+        assert 0.1 < look_at_pairs(np.array([[0, 1]]), previews, 400)[0] < 3.0
 
 
 def partners_by_hand(pairs, likenesses, enough_partners, enough_likeness):
     """The rule, image by image, as a person would follow it."""
-    stays = {row for row, value in enumerate(likenesses) if np.isnan(value)}
+    stays = set()
     near = (enough_partners + 1) // 2
     for image in np.unique(pairs):
-        own = [
-            row for row in range(len(pairs)) if image in pairs[row] and row not in stays_unknown(likenesses)
-        ]
+        own = [row for row in range(len(pairs)) if image in pairs[row]]
         own.sort(key=lambda row: (-likenesses[row], pairs[row].sum() - image))
         alternate = own[near : near + 2 * (enough_partners // 2) : 2]
         turns = own[:near] + alternate + [row for row in own[near:] if row not in alternate]
@@ -123,10 +134,6 @@ def partners_by_hand(pairs, likenesses, enough_partners, enough_likeness):
     return sorted(stays)
 
 
-def stays_unknown(likenesses):
-    return np.flatnonzero(np.isnan(likenesses)).tolist()
-
-
 @pytest.mark.parametrize(
     "enough", [(1, 0.0), (4, 0.0), (5, 20.0), (2, 60.0), (100, 0.0), (1, 1e9), (20, 0.0)]
 )
@@ -139,7 +146,6 @@ def test_partners_are_chosen_as_by_hand(enough):
     pairs = np.concatenate([pairs, chain])
     # whole numbers, so that many are alike
     likenesses = np.round(rng.exponential(6.0, len(pairs))).astype(np.float32)
-    likenesses[rng.random(len(pairs)) < 0.1] = np.nan
     stays = choose_partners(pairs, likenesses, *enough)
     assert np.flatnonzero(stays).tolist() == partners_by_hand(pairs, likenesses, *enough)
     order = rng.permutation(len(pairs))
@@ -148,12 +154,16 @@ def test_partners_are_chosen_as_by_hand(enough):
 
 def test_an_image_keeps_its_most_alike_partners_however_little_they_resemble_it():
     pairs = np.array([[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3], [0, 4], [1, 4]])
-    likenesses = np.array([5.0, 0.2, 0.3, 4.0, 0.1, 0.4, np.nan, 0.05], np.float32)
-    # partners in falling order: 0: 1 3 2; 1: 0 2 3 4; 2: 1 3 0; 3: 2 0 1; 4: 1
-    kept = [np.flatnonzero(alike_pairs(pairs, likenesses, 1.5, least)).tolist() for least in (0, 1, 2, 9)]
+    likenesses = np.array([5.0, 0.2, 0.3, 4.0, 0.1, 0.4, 0.01, 0.05], np.float32)
+    unsure = np.arange(8) == 6
+    # partners in falling order: 0: 1 3 2 4; 1: 0 2 3 4; 2: 1 3 0; 3: 2 0 1; 4: 1 0
+    kept = [
+        np.flatnonzero(alike_pairs(pairs, likenesses, unsure, 1.5, least)).tolist()
+        for least in (0, 1, 2, 9)
+    ]
     assert kept == [[0, 3, 6], [0, 3, 5, 6, 7], [0, 2, 3, 5, 6, 7], list(range(8))]
-    assert alike_pairs(pairs, likenesses, 0.0, 0).all()
-    assert alike_pairs(pairs[:0], likenesses[:0], 1.5, 3).tolist() == []
+    assert alike_pairs(pairs, likenesses, unsure, 0.0, 0).all()
+    assert alike_pairs(pairs[:0], likenesses[:0], unsure[:0], 1.5, 3).tolist() == []
 
 
 def test_an_image_of_weak_links_keeps_more_than_enough():

@@ -265,10 +265,8 @@ def test_pairs_are_looked_at_and_what_shares_nothing_is_left(dealt, whole):
     assert str(rows) == str(whole.select(options))
     likenesses = {pair: likeness for pair, *_, likeness in rows}
     overlapping = {(0, 1), (0, 5), (1, 5)}
-    # two images have too few keypoints to be looked at, so their pairs stay
-    assert {pair for pair in likenesses if {2, 3} & {*pair}} == {
-        p for p in likenesses if np.isnan(likenesses[p])
-    }
+    # two images have too few keypoints to tell strangers by
+    assert np.isfinite([*likenesses.values()]).all()
     strangers = [likenesses[pair] for pair in likenesses if 4 in pair and not {2, 3} & {*pair}]
     least = min(likenesses[pair] for pair in overlapping)
     assert len(strangers) == 3 and max(strangers) < 1.5 < least
