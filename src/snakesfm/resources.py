@@ -12,6 +12,10 @@ from dataclasses import dataclass
 AROUND_MB = 300
 # a busy file system and a slow start take minutes without any work
 START_MIN = 15
+# what needs were measured with, extract_features.max_shorter_side_px
+USUAL_SIDE_PX = 760
+# larger photographs are rare: who asks for more wants them as they are
+LARGEST_SIDE_PX = 6000
 
 
 @dataclass(frozen=True)
@@ -23,12 +27,14 @@ class Load:
     images, pairs : number of images and of pairs of images.
     networks : number of networks that are run on each.
     batch : how many images or pairs a network holds in the job's memory at once.
+    area : of the images in which keypoints are found, in those of the usual size.
     """
 
     images: float
     pairs: float
     networks: int = 0
     batch: int = 1
+    area: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -40,6 +46,7 @@ class Need:
     grain : 'block', 'tile' or 'scene': what one job is of.
     constant_mb, image_mb, pair_mb : memory of the stage whatever it works on, per image, and per pair.
     image_s, pair_s : seconds per image and per pair.
+    area_mb : memory that grows with the area of the images; their seconds then do, too.
     """
 
     grain: str
@@ -48,11 +55,13 @@ class Need:
     pair_mb: float = 0.0
     image_s: float = 0.0
     pair_s: float = 0.0
+    area_mb: float = 0.0
 
 
 NEEDS = {
     "index_images": Need("scene", 500, 0.02, image_s=0.12),
-    "extract_features": Need("block", 1500, 2.0, image_s=1.8),
+    # SIFT took 265 MB of one image of 760 pixels, 864 of 1520 and 3180 of 3000
+    "extract_features": Need("block", 1100, 2.0, image_s=1.8, area_mb=400),
     "learn_vocabulary": Need("scene", 1000, 0.01, image_s=0.1),
     "describe_images": Need("block", 500, 0.2, image_s=0.3),
     "select_pairs": Need("scene", 500, 0.15, 0.0005, image_s=0.2, pair_s=0.0012),
@@ -81,11 +90,24 @@ NEEDS = {
 NETWORK_MB, NETWORK_IMAGE_S, NETWORK_PAIR_S = 2600, 10.0, 17.0
 
 
-def job_load(stage: str, images: int, blocks: int, pairs: int, networks: int = 0, batch: int = 1) -> Load:
-    """What one job of a stage works on, on average over the scene's blocks or tiles."""
+def job_load(
+    stage: str,
+    images: int,
+    blocks: int,
+    pairs: int,
+    networks: int = 0,
+    batch: int = 1,
+    shorter_side_px: int = USUAL_SIDE_PX,
+) -> Load:
+    """What one job of a stage works on, on average over the scene's blocks or tiles.
+
+    ``shorter_side_px`` is what images are scaled down to before keypoints are found.
+    """
     grain = NEEDS[stage].grain
     if grain == "block":
-        return Load(images / blocks, 0, networks, batch)
+        side = min(shorter_side_px, LARGEST_SIDE_PX)
+        area = (side / USUAL_SIDE_PX) ** 2 if NEEDS[stage].area_mb else 1.0
+        return Load(images / blocks, 0, networks, batch, area)
     if grain == "tile":
         tiles = blocks * (blocks + 1) / 2
         return Load(min(2 / blocks, 1) * images, pairs / tiles, networks, batch)
@@ -96,16 +118,16 @@ def memory_mb(stage: str, load: Load, attempt: int = 1) -> int:
     """Megabytes that a stage's job asks for; each further attempt asks for twice as much."""
     need = NEEDS[stage]
     own = need.constant_mb + need.image_mb * load.images + need.pair_mb * load.pairs
-    own += NETWORK_MB * load.networks * load.batch
+    own += (need.area_mb + NETWORK_MB * load.networks * load.batch) * load.area
     return 100 * math.ceil((AROUND_MB + own) / 100) << (attempt - 1)
 
 
 def runtime_min(stage: str, load: Load, attempt: int = 1) -> int:
     """Minutes that a stage's job asks for; each further attempt asks for twice as much."""
     need = NEEDS[stage]
-    seconds = need.image_s * load.images + need.pair_s * load.pairs
+    seconds = need.image_s * load.images * load.area + need.pair_s * load.pairs
     # a tile's network sees its pairs, a block's its images
     seconds += load.networks * (
-        NETWORK_PAIR_S * load.pairs if load.pairs else NETWORK_IMAGE_S * load.images
+        NETWORK_PAIR_S * load.pairs if load.pairs else NETWORK_IMAGE_S * load.images * load.area
     )
     return (START_MIN + math.ceil(seconds / 60)) << (attempt - 1)

@@ -259,7 +259,8 @@ class ScenePlan:
         wanted = 1 if self.configuration.device == "cuda" else self.configuration.batch_size
         batch = 1 if wanted == "auto" else wanted
         pairs = self.proposed_pair_count if stage == "select_pairs" else self.pair_count
-        return job_load(stage, self.image_count, self.blocks, pairs, networks, batch)
+        side = self.configuration.extract_features.max_shorter_side_px
+        return job_load(stage, self.image_count, self.blocks, pairs, networks, batch, side)
 
     def final_files(self) -> list[str]:
         """What a person looks at: the scene's model, its metrics and its report."""

@@ -47,6 +47,18 @@ def test_the_page_on_clusters_names_the_needs(root: Path, stage: str) -> None:
     assert row in (root / "docs" / "cluster.md").read_text()
 
 
+@pytest.mark.parametrize(("side", "measured_mb"), [(760, 265), (1520, 864), (2200, 1739), (3000, 3180)])
+def test_larger_images_ask_for_what_they_take(side: int, measured_mb: int) -> None:
+    usual, load = (
+        job_load("extract_features", 100, 4, 3000, shorter_side_px=pixels) for pixels in (760, side)
+    )
+    assert 1.5 * measured_mb < memory_mb("extract_features", load) < 8 * measured_mb
+    assert runtime_min("extract_features", load) >= runtime_min("extract_features", usual)
+    huge = job_load("extract_features", 100, 4, 3000, shorter_side_px=20_000)
+    assert memory_mb("extract_features", huge) < 30_000
+    assert job_load("match_pairs", 100, 4, 3000, shorter_side_px=side).area == 1.0
+
+
 def test_a_network_asks_for_more() -> None:
     for stage, pairs in (("extract_features", 0), ("match_pairs", 300)):
         without, with_one = (job_load(stage, 40, 2, pairs, networks) for networks in (0, 1))
