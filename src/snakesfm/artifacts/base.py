@@ -188,7 +188,7 @@ def checksum(columns: Iterable[Array]) -> int:
         if column.dtype == object:
             total = zlib.crc32("\0".join(column.ravel()).encode(), total)
         else:
-            total = zlib.crc32(np.ascontiguousarray(column).reshape(-1).view(np.uint8), total)
+            total = zlib.crc32(np.ascontiguousarray(column).reshape(-1).view(np.uint8).data, total)
     return total
 
 
