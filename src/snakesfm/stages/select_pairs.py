@@ -81,7 +81,7 @@ def _look(
     few = counts < options.preview_keypoints
     if few.any():
         print(f"{few.sum()} images have fewer than {2 * options.preview_keypoints} keypoints to look at")
-    unsure: Array = few[table.pairs].any(axis=1) & (counts[table.pairs] > 1).all(axis=1)
+    unsure = np.asarray(few[table.pairs].any(axis=1) & (counts[table.pairs] > 1).all(axis=1))
     stays = alike_pairs(table.pairs, likenesses, unsure, options.min_likeness, options.least_partners)
     if options.enough_partners:
         rows, enough = np.flatnonzero(stays), (options.enough_partners, options.enough_likeness)
