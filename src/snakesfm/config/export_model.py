@@ -8,7 +8,7 @@ from snakesfm.config.base import StageOptions
 class ExportModelOptions(StageOptions):
     """How the model is written for other tools."""
 
-    stage_version: ClassVar[int] = 4
+    stage_version: ClassVar[int] = 5
 
     georeference: Literal["auto"] | bool = "auto"
     """Move models to metres east, north and up by the GPS in EXIF; 'auto': where the two agree."""
