@@ -14,7 +14,7 @@ class ExportModelOptions(StageOptions):
     """Move models to metres east, north and up by the GPS in EXIF; 'auto': where the two agree."""
 
     link_images: bool = True
-    """Link the images beside the model, so that 3DGS and nerfstudio tools read the folder as it is."""
+    """Link the images beside the model, so that COLMAP and nerfstudio read the folder as it is."""
 
     undistort: bool = False
-    """Also write images, masks and model with PINHOLE cameras, in 'undistorted', for some tools."""
+    """Also write images, masks and model with PINHOLE cameras, in 'undistorted', for Inria's 3DGS."""
