@@ -8,13 +8,13 @@ from snakesfm.config.base import StageOptions
 class ExportModelOptions(StageOptions):
     """How the model is written for other tools."""
 
-    stage_version: ClassVar[int] = 4
+    stage_version: ClassVar[int] = 5
 
     georeference: Literal["auto"] | bool = "auto"
     """Move models to metres east, north and up by the GPS in EXIF; 'auto': where the two agree."""
 
     link_images: bool = True
-    """Link the images beside the model, so that 3DGS and nerfstudio tools read the folder as it is."""
+    """Link the images beside the model, so that COLMAP and nerfstudio read the folder as it is."""
 
     undistort: bool = False
-    """Also write images, masks and model with PINHOLE cameras, in 'undistorted', for some tools."""
+    """Also write images, masks and model with PINHOLE cameras, in 'undistorted', for Inria's 3DGS."""

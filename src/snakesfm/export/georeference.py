@@ -18,6 +18,8 @@ COARSE_ERROR_M = 20.0
 # of a robust standard deviation: what counts as an inlier once the noise is measured
 INLIER_SIGMAS = 3.0
 LEAST_IMAGES = 4
+# of which a similarity is estimated
+MINIMAL_SAMPLE = 3
 LEAST_INLIERS = 0.5
 # positions must spread so many times farther than they err, in two directions, to tell the similarity
 LEAST_SPREAD = 10.0
@@ -32,8 +34,9 @@ class Georeference:
     origin : latitude and longitude in degrees, altitude in metres, WGS84.
     local_from_model : similarity from the model's world to the local one.
     images, inliers : images with a position in EXIF and a pose, and those that the similarity explains.
-    median_residual_m : between the cameras' positions and EXIF's.
-    spread_m : standard deviations (3,) of EXIF's positions along their principal axes, the largest first.
+    median_residual_m : between the inliers' positions and EXIF's.
+    spread_m : standard deviations (3,) of the inliers' positions in EXIF along their principal axes, the
+        largest first; a wrong position beside a straight flight would make it look broad.
     """
 
     origin: Origin
@@ -92,14 +95,15 @@ def georeference(centers: Array, gps: Array, origin: Origin, seed: int) -> Geore
         residuals = np.linalg.norm(found.transform_points(sources) - places, axis=1)
         inliers = residuals <= max_error
         max_error = max(INLIER_SIGMAS * robust_sigma(residuals, 0.0), 1e-6)
-    if found is None:
+    if found is None or inliers.sum() < MINIMAL_SAMPLE:
         return None
+    places = places[inliers]
     spread = np.linalg.svd(places - places.mean(axis=0), compute_uv=False) / np.sqrt(len(places))
     return Georeference(
         origin,
         found,
         int(known.sum()),
         int(inliers.sum()),
-        float(np.median(residuals)),
+        float(np.median(residuals[inliers])),
         (float(spread[0]), float(spread[1]), float(spread[2])),
     )

@@ -12,14 +12,18 @@ from snakesfm.geometry.poses import center_of
 Array = NDArray[Any]
 PERSPECTIVE_TERMS = ("k1", "k2", "k3", "p1", "p2")
 FISHEYE_TERMS = ("k1", "k2", "k3", "k4")
+# of wide lenses: terms of the angle come within a pixel or two up to 90 degrees, terms of the plane do not
+WIDE_MODELS = frozenset({"FOV", "EUCM", "SIMPLE_DIVISION", "DIVISION"})
 GRID = 25
 ROUND_TRIP_PX = 0.5
 FIT_PX = 0.5
+# of the grid's pixels, a tenth: fewer tell no lens
+LEAST_PIXELS = GRID**2 // 10
 
 
 def is_fisheye(camera: Camera) -> bool:
-    """Whether the camera's distortion is a function of the angle to the optical axis."""
-    return "FISHEYE" in camera.model
+    """Whether nerfstudio is told of distortion that is a function of the angle to the optical axis."""
+    return "FISHEYE" in camera.model or camera.model in WIDE_MODELS
 
 
 def transforms(
@@ -82,7 +86,8 @@ def camera_intrinsics(camera: Camera) -> dict[str, Any]:
     """Intrinsics in nerfstudio's names; distortion as OPENCV or OPENCV_FISHEYE.
 
     COLMAP models whose terms all have a name there are copied. Of the others the distortion is fitted
-    together with the focal length, which is linear least squares over a grid of pixels.
+    together with the focal length, which is linear least squares over a grid of pixels; all terms are 0
+    where that fails.
     """
     matrix = camera.to_pycolmap().calibration_matrix()
     content: dict[str, Any] = {
@@ -94,68 +99,86 @@ def camera_intrinsics(camera: Camera) -> dict[str, Any]:
         "cx": float(matrix[0, 2]),
         "cy": float(matrix[1, 2]),
     }
-    terms = FISHEYE_TERMS if is_fisheye(camera) else PERSPECTIVE_TERMS
-    native = _native_terms(camera, terms)
+    native = _native_terms(camera)
     if native is not None:
         return content | native
-    scale, fitted, _ = _fit_terms(camera)
+    fit = _fit_terms(camera)
+    if fit is None:
+        return content | dict.fromkeys(_term_names(camera), 0.0)
+    scale, fitted, _ = fit
     content["fl_x"], content["fl_y"] = scale * content["fl_x"], scale * content["fl_y"]
-    return content | dict(zip(terms, fitted, strict=True))
+    return content | dict(zip(_term_names(camera), fitted, strict=True))
 
 
 def camera_warnings(camera: Camera, camera_id: int) -> list[str]:
     """What a user of the exported camera should know: distortion that folds or is only approximate."""
     warnings = []
-    pixels = _pixel_grid(camera)
-    rays = camera.normalize(pixels)
-    again = np.asarray(camera.to_pycolmap().img_from_cam(np.column_stack([rays, np.ones(len(rays))])))
-    gap = np.linalg.norm(again - pixels, axis=1)
-    if not np.all(gap < ROUND_TRIP_PX):
+    *_, held = _rays_of_grid(camera)
+    if not held.all():
         warnings.append(
             f"camera {camera_id} ({camera.model}): the distortion is not invertible in the whole image, "
             "so tools that undistort will show folds near its corners."
         )
+    if _native_terms(camera) is not None:
         return warnings
-    terms = FISHEYE_TERMS if is_fisheye(camera) else PERSPECTIVE_TERMS
-    if _native_terms(camera, terms) is None:
-        error = _fit_terms(camera)[2]
-        if error > FIT_PX:
-            warnings.append(
-                f"camera {camera_id} ({camera.model}): transforms.json approximates the distortion "
-                f"to {error:.1f} px."
-            )
+    fit = _fit_terms(camera)
+    if fit is None:
+        warnings.append(
+            f"camera {camera_id} ({camera.model}): too little of the image lies within the lens to fit its "
+            "distortion, so transforms.json has none: check its intrinsics."
+        )
+    elif fit[2] > FIT_PX:
+        warnings.append(
+            f"camera {camera_id} ({camera.model}): transforms.json approximates the distortion "
+            f"to {fit[2]:.1f} px."
+        )
     return warnings
 
 
-def _native_terms(camera: Camera, terms: tuple[str, ...]) -> dict[str, float] | None:
+def _term_names(camera: Camera) -> tuple[str, ...]:
+    return FISHEYE_TERMS if is_fisheye(camera) else PERSPECTIVE_TERMS
+
+
+def _native_terms(camera: Camera) -> dict[str, float] | None:
     """The distortion terms under nerfstudio's names, None if one that is not zero has none."""
+    if camera.model in WIDE_MODELS:
+        return None
     names = [name.strip() for name in camera.to_pycolmap().params_info.split(",")]
-    found = dict.fromkeys(terms, 0.0)
+    found = dict.fromkeys(_term_names(camera), 0.0)
     for name, value in zip(names, camera.params, strict=True):
         if name in {"f", "fx", "fy", "cx", "cy"}:
             continue
         name = "k1" if name == "k" else name
-        if name in found and "THIN_PRISM" not in camera.model and "DIVISION" not in camera.model:
+        if name in found and "THIN_PRISM" not in camera.model:
             found[name] = float(value)
-        elif value != 0.0 or camera.model == "FOV":
+        elif value != 0.0:
             return None
     return found
 
 
-def _pixel_grid(camera: Camera) -> Array:
+def _rays_of_grid(camera: Camera) -> tuple[Array, Array, Array]:
+    """A grid of pixels (G,2), their rays (G,2) on the plane z = 1, and which of these lead back, (G,)."""
     columns, rows = np.meshgrid(
         np.linspace(0.5, camera.width - 0.5, GRID), np.linspace(0.5, camera.height - 0.5, GRID)
     )
-    return np.column_stack([columns.ravel(), rows.ravel()])
+    pixels = np.column_stack([columns.ravel(), rows.ravel()])
+    rays = camera.normalize(pixels)
+    again = np.asarray(camera.to_pycolmap().img_from_cam(np.column_stack([rays, np.ones(len(rays))])))
+    return pixels, rays, np.linalg.norm(again - pixels, axis=1) < ROUND_TRIP_PX
 
 
-def _fit_terms(camera: Camera) -> tuple[float, list[float], float]:
-    """Focal scale and distortion terms fitted over a grid of pixels, and the largest error in pixels."""
-    pixels = _pixel_grid(camera)
+def _fit_terms(camera: Camera) -> tuple[float, list[float], float] | None:
+    """Focal scale and distortion terms fitted over a grid of pixels, and the largest error in pixels.
+
+    Pixels that lie outside the lens have no say; None where too few are left, or a fit makes no lens.
+    """
+    pixels, rays, held = _rays_of_grid(camera)
+    if held.sum() < LEAST_PIXELS:
+        return None
     matrix = camera.to_pycolmap().calibration_matrix()
     focal = matrix[[0, 1], [0, 1]]
-    distorted = (pixels - matrix[:2, 2]) / focal
-    x, y = camera.normalize(pixels).T
+    distorted = (pixels[held] - matrix[:2, 2]) / focal
+    x, y = rays[held].T
     squared = x**2 + y**2
     if is_fisheye(camera):
         radius = np.sqrt(squared)
@@ -173,4 +196,6 @@ def _fit_terms(camera: Camera) -> tuple[float, list[float], float]:
     solution = np.linalg.lstsq(design, target, rcond=None)[0]
     residuals = (design @ solution - target).reshape(-1, 2)
     scale = float(solution[0])
+    if scale <= 0:
+        return None
     return scale, (solution[1:] / scale).tolist(), float(np.linalg.norm(residuals, axis=1).max())

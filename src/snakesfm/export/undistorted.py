@@ -4,18 +4,26 @@ import shutil
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
+from snakesfm.errors import ImageError
 from snakesfm.geometry.colmap_binding import pycolmap
 from snakesfm.ingest.masks import find_mask, read_mask
 
+Array = NDArray[Any]
 JPEG_SUFFIXES = (".jpg", ".jpeg")
+# COLMAP takes less for none, and it moves no pixel by a thousandth
+LEAST_DISTORTION = 1e-7
 
 
 def write_undistorted(target: Path, sparse: Path, images: Path, masks: Path | None, threads: int) -> None:
     """Write ``target``/images and ``target``/sparse/0 with PINHOLE cameras, for tools that know no other.
+
+    Images and masks of perspective cameras without distortion keep their size and every pixel.
 
     Parameters
     ----------
@@ -27,15 +35,23 @@ def write_undistorted(target: Path, sparse: Path, images: Path, masks: Path | No
 
     Raises
     ------
-    ImageError : an image can no longer be read.
+    ImageError : an image can no longer be read, or has another size than its camera.
     ConfigError : a mask cannot be used.
     """
     model = pycolmap.Reconstruction(str(sparse))
     registered = [model.images[image_id] for image_id in model.reg_image_ids()]
+    with ThreadPoolExecutor(threads) as pool:
+        list(pool.map(partial(_check_size, images, model), registered))
+    for camera in model.cameras.values():
+        _replace_undistorted(camera)
+    distorted = target / "distorted"
+    distorted.mkdir(parents=True)
+    model.write_binary(str(distorted))
     jpegs = [image.name for image in registered if image.name.lower().endswith(JPEG_SUFFIXES)]
     # of no names COLMAP takes all
     names = jpegs or [image.name for image in registered[:1]]
-    pycolmap.undistort_images(str(target), str(sparse), str(images), names, num_threads=threads)
+    pycolmap.undistort_images(str(target), str(distorted), str(images), names, num_threads=threads)
+    shutil.rmtree(distorted)
     with ThreadPoolExecutor(threads) as pool:
         list(pool.map(partial(_write_other, target / "images", images, model), registered))
         if masks is not None:
@@ -48,6 +64,32 @@ def write_undistorted(target: Path, sparse: Path, images: Path, masks: Path | No
     shutil.rmtree(target / "stereo")
     for script in target.glob("run-colmap-*.sh"):
         script.unlink()
+
+
+def _replace_undistorted(camera: "pycolmap.Camera") -> None:
+    """Make a camera whose distortion is all 0, which COLMAP leaves as it is, PINHOLE or a true fisheye."""
+    if not camera.is_undistorted():
+        return
+    matrix = camera.calibration_matrix()
+    pinhole = [matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]]
+    if camera.is_perspective_fisheye():
+        camera.model = pycolmap.CameraModelId.OPENCV_FISHEYE
+        camera.params = [*pinhole, LEAST_DISTORTION, 0.0, 0.0, 0.0]
+    else:
+        camera.model = pycolmap.CameraModelId.PINHOLE
+        camera.params = pinhole
+
+
+def _check_size(images: Path, model: "pycolmap.Reconstruction", image: "pycolmap.Image") -> None:
+    """Refuse an image of another size than its camera, which would end COLMAP without a word."""
+    from snakesfm.ingest.read import read_header
+
+    header, camera = read_header(images / image.name), model.cameras[image.camera_id]
+    if (header.width, header.height) != (camera.width, camera.height):
+        raise ImageError(
+            f"{images / image.name} has {header.width} x {header.height} pixels but its camera "
+            f"{camera.width} x {camera.height}: put back the image that the model was made of."
+        )
 
 
 def _write_other(
@@ -65,11 +107,11 @@ def _write_other(
 
     from snakesfm.ingest.read import read_image
 
-    pixels = pycolmap.Bitmap.from_array(read_image(images / image.name).rgb)
+    options = pycolmap.UndistortCameraOptions()
     camera = model.cameras[image.camera_id]
-    bitmap, _ = pycolmap.undistort_image(pycolmap.UndistortCameraOptions(), pixels, camera)
+    pixels = _undistort(read_image(images / image.name).rgb, camera, options)
     file.parent.mkdir(parents=True, exist_ok=True)
-    Image.fromarray(bitmap.to_array()).save(file, lossless=True, quality=95)
+    Image.fromarray(pixels).save(file, lossless=True, quality=95)
 
 
 def _write_mask(
@@ -87,7 +129,17 @@ def _write_mask(
     size = camera.width, camera.height
     shown = 255 * read_mask(mask, size).astype(np.uint8)
     shown = cv2.resize(shown, size, interpolation=cv2.INTER_NEAREST)
-    bitmap, _ = pycolmap.undistort_image(options, pycolmap.Bitmap.from_array(shown), camera)
     file = target / f"{image.name}.png"
     file.parent.mkdir(parents=True, exist_ok=True)
-    bitmap.write(str(file))
+    pycolmap.Bitmap.from_array(_undistort(shown, camera, options)).write(str(file))
+
+
+def _undistort(
+    pixels: Array, camera: "pycolmap.Camera", options: "pycolmap.UndistortCameraOptions"
+) -> Array:
+    """Pixels (H,W) or (H,W,3) uint8 without the camera's distortion; themselves of a PINHOLE camera."""
+    if camera.model_name == "PINHOLE":
+        return pixels
+    bitmap, _ = pycolmap.undistort_image(options, pycolmap.Bitmap.from_array(pixels), camera)
+    undistorted: Array = bitmap.to_array()
+    return undistorted

@@ -107,11 +107,12 @@ def read_image(path: Path | str, shorter_side_px: int | None = None) -> ImagePix
                 return _decode_jpeg(Path(path), min(image.size), shorter_side_px)
             turn_back = UNDO_TURN.get(_tiff_orientation(image))
             # loading drops what tells the depth, but no damage passes it
-            deep = _has_deep_colours(image)
+            layout = _layout_of_deep_colours(image)
+            # colours of RGBa are multiplied by alpha already
+            transparent = image.has_transparency_data and "RGBa" not in layout
             image.load()
-            if deep:
-                rgb = _decode_rgb(Path(path), cv2.IMREAD_COLOR_BGR | cv2.IMREAD_ANYDEPTH)
-                return _from_rgb(_to_8_bit(rgb))
+            if layout:
+                image = Image.fromarray(_decode_deep(Path(path), transparent))
             return _to_pixels(image if turn_back is None else image.transpose(turn_back))
         # PIL raises errors of every type on damaged files, and one bad image must not stop the others
         except Exception as error:
@@ -231,22 +232,32 @@ def _decode_jpeg(path: Path, side: int, shorter_side_px: int | None) -> ImagePix
         4: cv2.IMREAD_REDUCED_COLOR_4,
         8: cv2.IMREAD_REDUCED_COLOR_8,
     }[reduction]
-    return _from_rgb(_decode_rgb(path, flags), reduction)
+    return _from_rgb(cv2.cvtColor(_decode(path, flags), cv2.COLOR_BGR2RGB), reduction)
 
 
-def _decode_rgb(path: Path, flags: int) -> Array:
-    """The stored pixels (H,W,3) by OpenCV, as deep as the flags let them be."""
+def _decode(path: Path, flags: int) -> Array:
+    """Colours (H,W,3) or (H,W,4) in OpenCV's order, turned where a TIFF file asks for it."""
     data = np.frombuffer(path.read_bytes(), np.uint8)
-    bgr = cv2.imdecode(data, flags | cv2.IMREAD_IGNORE_ORIENTATION)
-    if bgr is None:
+    colours = cv2.imdecode(data, flags | cv2.IMREAD_IGNORE_ORIENTATION)
+    if colours is None:
         raise ValueError("it cannot be decoded")
-    return np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB))
+    return np.asarray(colours)
 
 
-def _has_deep_colours(image: Image.Image) -> bool:
-    """Whether PIL would cut opaque colours of 16 bits to their upper 8."""
-    opaque = image.mode == "RGB" and not image.has_transparency_data
-    return opaque and any(";16" in str(tile[3]) for tile in image.tile)
+def _layout_of_deep_colours(image: Image.Image) -> str:
+    """What PIL calls the file's order of colours of 16 bits, which it would cut to their upper 8, or ''."""
+    if image.mode not in ("RGB", "RGBA"):
+        return ""
+    return next((str(tile[3]) for tile in image.tile if ";16" in str(tile[3])), "")
+
+
+def _decode_deep(path: Path, transparent: bool) -> Array:
+    """Colours of 16 bits as uint8 (H,W,3), turned as PIL turns them; ``transparent``: over black."""
+    colours = _decode(path, cv2.IMREAD_UNCHANGED)
+    rgb = colours[..., 2::-1]
+    if transparent:
+        rgb = rgb.astype(np.uint32) * colours[..., 3:] // np.iinfo(colours.dtype).max
+    return _to_8_bit(rgb)
 
 
 def _to_pixels(image: Image.Image) -> ImagePixels:

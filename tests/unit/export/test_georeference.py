@@ -56,6 +56,25 @@ def test_an_object_smaller_than_the_error_or_a_line_is_not_trusted(noise_m, shap
     assert found is None or not found.trusted
 
 
+@pytest.mark.parametrize("wrong", [[0.0, 0.0, -281.0], [0.0, 3000.0, 0.0], [900.0, 400.0, 100.0]])
+@pytest.mark.parametrize("seed", range(4))
+def test_a_wrong_position_beside_a_line_does_not_make_it_an_area(seed, wrong):
+    rng = np.random.default_rng(seed)
+    for width_m, trusted in ((0.0, False), (60.0, True)):
+        local = np.zeros((20, 3))
+        local[:, 0], local[1::2, 1] = 20.0 * np.arange(20), width_m
+        centers = 0.1 * local @ project_to_so3(rng.normal(size=(3, 3))) + rng.normal(size=(20, 3)) * 0.002
+        noisy = local + rng.normal(size=(20, 3)) * 1.5
+        noisy[7] += wrong
+        gps = pycolmap.GPSTransform().enu_to_ellipsoid(noisy, *ORIGIN)
+        found = georeference(centers, gps, local_origin(gps), 0)
+        assert found.trusted == trusted
+        assert found.inliers == 19
+        assert 1.0 < found.median_residual_m < 3.5
+        assert 90.0 < found.spread_m[0] < 140.0
+        assert width_m / 3 <= found.spread_m[1] < width_m / 2 + 5.0
+
+
 def test_few_positions_tell_nothing():
     centers, gps, _ = survey()
     gps[3:] = np.nan

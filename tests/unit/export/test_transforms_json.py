@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from snakesfm.export.nerfstudio import camera_intrinsics, camera_warnings, transforms
+from snakesfm.export.nerfstudio import camera_intrinsics, camera_warnings, is_fisheye, transforms
 from snakesfm.geometry.camera import Camera
 
 SIZE = (640, 480)
@@ -79,6 +79,76 @@ def test_other_models_are_approximated_below_half_a_pixel(model, params) -> None
     gap = largest_gap(camera)
     assert 0 < gap < 0.5
     assert camera_warnings(camera, 1) == []
+
+
+@pytest.mark.parametrize(
+    ("model", "params", "most_px"),
+    [
+        ("FOV", (256.9, 256.7, 319.7, 242.1, 0.925), 1e-3),
+        ("FOV", (160.0, 160.0, 320.0, 240.0, 1.2), 0.5),
+        ("EUCM", (160.0, 160.0, 320.0, 240.0, 0.6, 1.1), 0.1),
+        ("SIMPLE_DIVISION", (250.0, 320.0, 240.0, -0.6), 0.5),
+        (
+            "THIN_PRISM_FISHEYE",
+            (150.0, 150.0, 320.0, 240.0, 0.02, 0.01, 0.0, 0.0, 1e-3, 5e-4, 0.0, 0.0),
+            0.5,
+        ),
+    ],
+)
+def test_wide_lenses_are_fisheye_and_fitted_where_the_image_lies_within_them(
+    model, params, most_px
+) -> None:
+    camera = Camera(model, *SIZE, params)
+    content = camera_intrinsics(camera)
+    assert is_fisheye(camera)
+    assert content["camera_model"] == "OPENCV_FISHEYE"
+    assert 0.8 * params[0] < content["fl_x"] < 1.25 * params[0]
+    pixels = np.random.default_rng(0).uniform(0, 1, (400, 2)) * SIZE
+    rays = camera.normalize(pixels)
+    again = np.asarray(camera.to_pycolmap().img_from_cam(np.column_stack([rays, np.ones(len(rays))])))
+    within = np.linalg.norm(again - pixels, axis=1) < 0.1
+    assert 100 < within.sum() <= 400
+    assert np.abs(distort(content, rays[within]) - pixels[within]).max() < most_px
+    assert len(camera_warnings(camera, 1)) == (not within.all())
+
+
+@pytest.mark.parametrize(
+    ("model", "params"),
+    [
+        ("EUCM", (30.0, 31.0, 320.0, 240.0, 0.7, 2.0)),
+        ("FOV", (30.0, 31.0, 320.0, 240.0, 1.2)),
+        ("FULL_OPENCV", (300.0, 300.0, 320.0, 240.0, -4.8, 1.6, 0.0, 0.0, 1.3, -2.6, -3.3, 0.0)),
+    ],
+)
+def test_what_is_no_lens_has_no_terms_and_a_warning(model, params) -> None:
+    camera = Camera(model, *SIZE, params)
+    content = camera_intrinsics(camera)
+    assert (content["fl_x"], content["fl_y"]) == params[:2]
+    assert not any(value for name, value in content.items() if name[0] in "kp")
+    assert "k1" in content
+    *_, warning = camera_warnings(camera, 3)
+    assert warning.startswith(f"camera 3 ({model})")
+    assert "transforms.json has none" in warning
+
+
+def test_a_wide_model_is_of_one_kind_with_fisheye_and_not_with_perspective() -> None:
+    wide = Camera("FOV", *SIZE, (300.0, 300.0, 320.0, 240.0, 0.9))
+    fisheye = Camera("OPENCV_FISHEYE", *SIZE, NATIVE["OPENCV_FISHEYE"][0])
+    perspective = Camera("SIMPLE_RADIAL", *SIZE, NATIVE["SIMPLE_RADIAL"][0])
+    for other, kinds in ((fisheye, 1), (perspective, 2)):
+        cameras = [wide, other]
+        content = transforms(
+            ["a.jpg", "b.jpg"],
+            np.arange(2),
+            cameras,
+            np.tile(np.eye(3), (2, 1, 1)),
+            np.zeros((2, 3)),
+            np.arange(2),
+            {},
+        )
+        assert len({frame["camera_model"] for frame in content["frames"]}) == kinds
+        assert len({is_fisheye(camera) for camera in cameras}) == kinds
+        assert content["frames"][0]["camera_model"] == "OPENCV_FISHEYE"
 
 
 def test_distortion_that_folds_is_warned_of() -> None:

@@ -1,4 +1,5 @@
 import io
+import struct
 
 import cv2
 import numpy as np
@@ -103,6 +104,67 @@ def test_colours_of_12_bits_in_16_are_not_dark(tmp_path, picture, name):
     bright = np.maximum(picture, 200)
     cv2.imwrite(str(path), cv2.cvtColor(bright.astype(np.uint16) << 4, cv2.COLOR_RGB2BGR))
     np.testing.assert_array_equal(read_image(path).rgb, bright)
+
+
+def deep_tiff(path, colours, orientation, extra_samples=()):
+    """A TIFF file of one strip of 16-bit colours (H,W,C), which neither PIL nor OpenCV writes turned."""
+    height, width, channels = colours.shape
+    data = colours.astype("<u2").tobytes()
+    short, long = 3, 4
+    tags = [
+        (256, long, [width]),
+        (257, long, [height]),
+        (258, short, [16] * channels),
+        (259, short, [1]),
+        (262, short, [2]),
+        (273, long, [8]),
+        (274, short, [orientation]),
+        (277, short, [channels]),
+        (278, long, [height]),
+        (279, long, [len(data)]),
+        *([(338, short, list(extra_samples))] if extra_samples else []),
+    ]
+    entries, rest = b"", b""
+    place = 8 + len(data) + 2 + 12 * len(tags) + 4
+    for tag, kind, values in tags:
+        packed = struct.pack(f"<{len(values)}{'H' if kind == short else 'I'}", *values)
+        if len(packed) > 4:
+            packed, rest = struct.pack("<I", place + len(rest)), rest + packed
+        entries += struct.pack("<HHI", tag, kind, len(values)) + packed.ljust(4, b"\0")
+    directory = struct.pack("<H", len(tags)) + entries + bytes(4)
+    path.write_bytes(b"II*\0" + struct.pack("<I", 8 + len(data)) + data + directory + rest)
+    return path
+
+
+@pytest.mark.parametrize("value", range(1, 9))
+def test_orientation_of_deep_colours_is_not_applied(tmp_path, picture, value):
+    path = deep_tiff(tmp_path / "deep.tif", np.maximum(picture, 200).astype(np.uint16) << 8, value)
+    assert read_header(path).exif.orientation == value
+    np.testing.assert_array_equal(read_image(path).rgb, np.maximum(picture, 200))
+
+
+@pytest.mark.parametrize("name", ["deep.png", "deep.tif"])
+def test_transparent_colours_of_12_bits_in_16_are_composed_over_black_and_not_dark(tmp_path, picture, name):
+    bright, alpha = np.maximum(picture, 200), np.zeros(picture.shape[:2], np.uint16)
+    alpha[:, :90], alpha[:, 90:140] = 0xFFFF, 0x7FFF
+    colours = np.dstack([bright.astype(np.uint16) << 4, alpha])
+    path = tmp_path / name
+    if name.endswith(".png"):
+        cv2.imwrite(str(path), cv2.cvtColor(colours, cv2.COLOR_RGBA2BGRA))
+    else:
+        deep_tiff(path, colours, 1, extra_samples=(2,))
+    found = read_image(path).rgb
+    np.testing.assert_array_equal(found[:, :90], bright[:, :90])
+    np.testing.assert_allclose(found[:, 90:140], bright[:, 90:140] / 2, atol=1)
+    assert not found[:, 140:].any()
+
+
+def test_deep_colours_that_alpha_is_multiplied_into_stay_as_they_are(tmp_path, picture):
+    colours = np.dstack(
+        [np.maximum(picture, 200).astype(np.uint16) << 4, picture[..., 0].astype(np.uint16) << 8]
+    )
+    path = deep_tiff(tmp_path / "deep.tif", colours, 1, extra_samples=(1,))
+    np.testing.assert_array_equal(read_image(path).rgb, np.maximum(picture, 200))
 
 
 def test_one_bit_and_transparent_pixels(tmp_path, picture):

@@ -1,0 +1,112 @@
+"""The folder ``undistorted`` of cameras without distortion: always PINHOLE, and of its images' sizes."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pycolmap
+import pytest
+from PIL import Image
+
+from snakesfm.errors import ImageError
+from snakesfm.export.undistorted import write_undistorted
+
+# the size at which COLMAP, warping what needs no warp, loses two columns and two rows
+WIDTH, HEIGHT = 570, 380
+SPOT = (430, 110)
+SUFFIXES = (".jpg", ".png", ".tif", ".webp")
+PERSPECTIVE = {
+    "SIMPLE_PINHOLE": [480, 280, 185],
+    "PINHOLE": [480, 485, 280, 185],
+    "SIMPLE_RADIAL": [480, 280, 185, 0],
+    "OPENCV": [480, 485, 280, 185, 0, 0, 0, 0],
+    "FULL_OPENCV": [480, 485, 280, 185, *[0] * 8],
+    "DIVISION": [480, 485, 280, 185, 0],
+}
+FISHEYE = {
+    "SIMPLE_FISHEYE": [300, 280, 185],
+    "FISHEYE": [300, 305, 280, 185],
+    "SIMPLE_RADIAL_FISHEYE": [300, 280, 185, 0],
+    "OPENCV_FISHEYE": [300, 305, 280, 185, 0, 0, 0, 0],
+    "THIN_PRISM_FISHEYE": [300, 305, 280, 185, *[0] * 8],
+}
+DISTORTED = {
+    "SIMPLE_RADIAL": [480, 280, 185, -0.1],
+    "OPENCV_FISHEYE": [300, 305, 280, 185, 0.02, 0, 0, 0],
+}
+
+
+def undistort(
+    folder: Path, model: str, params: list[float], width: int = WIDTH
+) -> tuple[pycolmap.Camera, dict[str, np.ndarray], np.ndarray]:
+    """The one camera and the images by suffix without distortion, and the one image before."""
+    shown = np.full((HEIGHT, width, 3), 60, np.uint8)
+    cv2.circle(shown, SPOT, 15, (200, 210, 190), -1)
+    (folder / "images").mkdir()
+    (folder / "sparse").mkdir()
+    camera = pycolmap.Camera(camera_id=1, model=model, width=WIDTH, height=HEIGHT, params=params)
+    reconstruction = pycolmap.Reconstruction()
+    reconstruction.add_camera_with_trivial_rig(camera)
+    for number, suffix in enumerate(SUFFIXES, start=1):
+        options = {"lossless": True} if suffix == ".webp" else {"quality": 97}
+        Image.fromarray(shown).save(folder / "images" / f"a{suffix}", **options)
+        image = pycolmap.Image(name=f"a{suffix}", camera_id=1, image_id=number)
+        reconstruction.add_image_with_trivial_frame(image, pycolmap.Rigid3d())
+        (folder / "masks").mkdir(exist_ok=True)
+        mask = Image.fromarray(np.uint8(255 * (shown[..., 0] > 100)))
+        mask.save(folder / "masks" / f"a{suffix}.png")
+    reconstruction.write_binary(str(folder / "sparse"))
+    flat = folder / "flat"
+    write_undistorted(flat, folder / "sparse", folder / "images", folder / "masks", 2)
+    assert sorted(path.name for path in flat.iterdir()) == ["images", "masks", "sparse"]
+    written = pycolmap.Reconstruction(str(flat / "sparse" / "0"))
+    assert written.num_reg_images() == len(SUFFIXES)
+    (camera,) = written.cameras.values()
+    images = {}
+    for suffix in SUFFIXES:
+        images[suffix] = np.asarray(Image.open(flat / "images" / f"a{suffix}"))
+        mask = np.asarray(Image.open(flat / "masks" / f"a{suffix}.png"))
+        assert images[suffix].shape == (camera.height, camera.width, 3)
+        assert mask.shape == (camera.height, camera.width)
+        assert set(np.unique(mask)) == {0, 255}
+        assert np.mean((mask > 0) != (images[suffix][..., 0] > 130)) < 0.002
+    return camera, images, shown
+
+
+@pytest.mark.parametrize("model", sorted(PERSPECTIVE))
+def test_perspective_images_without_distortion_keep_every_pixel(tmp_path, model: str) -> None:
+    params = PERSPECTIVE[model]
+    camera, images, shown = undistort(tmp_path, model, params)
+    assert (camera.model_name, camera.width, camera.height) == ("PINHOLE", WIDTH, HEIGHT)
+    single = model.startswith("SIMPLE")
+    assert camera.params.tolist() == ([params[0], *params[:3]] if single else params[:4])
+    for suffix in (".png", ".tif", ".webp"):
+        np.testing.assert_array_equal(images[suffix], shown)
+    jpeg = (tmp_path / "images" / "a.jpg").read_bytes()
+    assert (tmp_path / "flat" / "images" / "a.jpg").read_bytes() == jpeg
+
+
+@pytest.mark.parametrize(
+    ("model", "params"),
+    [*sorted(FISHEYE.items()), *sorted(DISTORTED.items())],
+    ids=lambda value: str(value),
+)
+def test_fisheye_images_are_warped_even_where_all_terms_are_0(
+    tmp_path, model: str, params: list[float]
+) -> None:
+    camera, images, _ = undistort(tmp_path, model, params)
+    assert camera.model_name == "PINHOLE"
+    before = pycolmap.Camera(camera_id=1, model=model, width=WIDTH, height=HEIGHT, params=params)
+    spot = np.array(SPOT) + 0.5
+    expected = camera.img_from_cam(np.append(before.cam_from_img(spot), 1.0))
+    assert np.linalg.norm(np.asarray(expected) - spot) > 5.0
+    for suffix in SUFFIXES:
+        rows, columns = np.nonzero(images[suffix][..., 0] > 130)
+        found = np.array([columns.mean(), rows.mean()]) + 0.5
+        # a circle becomes an egg
+        assert np.linalg.norm(found - expected) < 1.5
+
+
+def test_an_image_of_another_size_than_its_camera_is_named(tmp_path) -> None:
+    with pytest.raises(ImageError, match=r"a\.\w+ has 560 x 380 pixels but its camera 570 x 380: put back"):
+        undistort(tmp_path, "SIMPLE_RADIAL", DISTORTED["SIMPLE_RADIAL"], width=560)
