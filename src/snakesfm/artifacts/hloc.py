@@ -55,8 +55,8 @@ def read_hloc_features(file: h5py.File, name: str) -> dict[str, Array] | None:
     ------
     ConfigError : the image's arrays do not fit together.
     """
-    group = file.get(name)
-    if not isinstance(group, h5py.Group) or "keypoints" not in group:
+    group = _features_of(file, name)
+    if group is None:
         return None
     keypoints = group["keypoints"][()].astype(np.float32).reshape(-1, 2)
     count = len(keypoints)
@@ -73,6 +73,30 @@ def read_hloc_features(file: h5py.File, name: str) -> dict[str, Array] | None:
             "write it again with hloc."
         )
     return found
+
+
+def read_hloc_size(file: h5py.File, name: str) -> tuple[int, int] | None:
+    """Width and height in pixels of the image that hloc found an image's keypoints in; None where not told.
+
+    Raises
+    ------
+    ConfigError : what is told is no size.
+    """
+    group = _features_of(file, name)
+    if group is None or "image_size" not in group:
+        return None
+    told = np.ravel(group["image_size"][()])
+    if len(told) != 2 or not (told >= 1).all():
+        raise ConfigError(
+            f"{file.filename} has an image_size of '{name}' that is no width and height: write it again "
+            "with hloc."
+        )
+    return int(told[0]), int(told[1])
+
+
+def _features_of(file: h5py.File, name: str) -> h5py.Group | None:
+    group = file.get(name)
+    return group if isinstance(group, h5py.Group) and "keypoints" in group else None
 
 
 def descriptor_size(file: h5py.File) -> int:

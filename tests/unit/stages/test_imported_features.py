@@ -1,0 +1,95 @@
+"""Stage extract_features on hloc's files: of images of other sizes, and of shapes that other tools write."""
+
+import cv2
+import h5py
+import numpy as np
+import pytest
+
+from snakesfm.artifacts import Header, ImageIndex, LocalFeatures
+from snakesfm.config.extract_features import ExtractFeaturesOptions
+from snakesfm.errors import ConfigError
+from snakesfm.geometry.camera import PARAM_SLOTS
+from snakesfm.stages import extract_features
+from snakesfm.stages.job import StageJob
+
+WIDTH, HEIGHT = 403, 302
+
+
+@pytest.fixture
+def extract(tmp_path):
+    """Run the stage on arrays by image, for images of 403 x 302 pixels; the keypoints of each."""
+
+    def run(arrays):
+        names = sorted(arrays)
+        rng = np.random.default_rng(0)
+        for name in names:
+            pixels = rng.integers(0, 255, (HEIGHT, WIDTH), dtype=np.uint8)
+            cv2.imwrite(str(tmp_path / name), pixels)
+        columns = {"orientations": 1, "duplicate_of": -1, "blocks": 0, "camera_ids": 0}
+        ImageIndex(
+            names=names,
+            sizes=np.tile([WIDTH, HEIGHT], (len(names), 1)),
+            sha256=names,
+            focal_exif_px=np.full(len(names), np.nan),
+            gps=np.full((len(names), 3), np.nan),
+            camera_models=[],
+            camera_sizes=np.zeros((0, 2), int),
+            camera_params=np.zeros((0, PARAM_SLOTS)),
+            camera_sources=[],
+            refused_names=[],
+            refused_reasons=[],
+            **{name: np.full(len(names), value) for name, value in columns.items()},
+        ).write(tmp_path / "index.h5", Header("index_images", 1, "scene"))
+        with h5py.File(tmp_path / "features.h5", "w") as file:
+            for name, group in arrays.items():
+                for key, values in group.items():
+                    file[f"{name}/{key}"] = values
+        output = tmp_path / "0.h5"
+        extract_features.run(
+            StageJob(
+                stage="extract_features",
+                scene="scene",
+                inputs={"index": tmp_path / "index.h5"},
+                outputs=(output,),
+                options=ExtractFeaturesOptions(method="imported"),
+                settings={"images": str(tmp_path), "imported": str(tmp_path), "block": 0},
+            )
+        )
+        return LocalFeatures.read(output)
+
+    return run
+
+
+def keypoints(count=5, **changes):
+    rng = np.random.default_rng(count)
+    places = rng.uniform([0, 0], [WIDTH - 1, HEIGHT - 1], (count, 2)).astype(np.float32)
+    return {"keypoints": places, "descriptors": rng.normal(size=(16, count)).astype(np.float32)} | changes
+
+
+@pytest.mark.parametrize("factor", [2, 0.5])
+def test_keypoints_of_larger_or_smaller_photographs_are_scaled(extract, capsys, factor):
+    seen = np.array([round(WIDTH * factor), round(HEIGHT * factor)])
+    # edges map to edges, and hloc's first pixel has its centre at 0
+    there = (keypoints()["keypoints"] + 0.5) * (seen / [WIDTH, HEIGHT]) - 0.5
+    scaled = keypoints(keypoints=there, scales=np.full(5, 4.0 * factor), image_size=seen)
+    found = extract({"a.png": scaled, "b.png": scaled, "c.png": keypoints(image_size=[WIDTH, HEIGHT])})
+    for image in range(3):
+        part = slice(5 * image, 5 * image + 5)
+        np.testing.assert_allclose(found.keypoints[part], keypoints()["keypoints"] + 0.5, atol=2e-3)
+    np.testing.assert_allclose(found.scales, [*[4.0] * 10, *[1.0] * 5], rtol=5e-3)
+    said = [line for line in capsys.readouterr().out.splitlines() if "are scaled" in line]
+    assert len(said) == 1
+    assert f"'a.png' had {seen[0]} x {seen[1]} pixels and has {WIDTH} x {HEIGHT}" in said[0]
+
+
+@pytest.mark.parametrize("seen", [(HEIGHT, WIDTH), (WIDTH, HEIGHT - 10), (2 * WIDTH, HEIGHT)])
+def test_keypoints_of_a_photograph_with_another_aspect_are_refused(extract, seen):
+    words = rf"'a\.png' in an image of {seen[0]} x {seen[1]} pixels, but here it has {WIDTH} x {HEIGHT}"
+    with pytest.raises(ConfigError, match=words):
+        extract({"a.png": keypoints(image_size=seen)})
+
+
+@pytest.mark.parametrize("seen", [[0, 0], [WIDTH], [np.nan, 10]])
+def test_an_image_size_that_is_none_is_refused(extract, seen):
+    with pytest.raises(ConfigError, match=r"image_size of 'a\.png' that is no width and height"):
+        extract({"a.png": keypoints(image_size=seen)})
