@@ -1,8 +1,9 @@
 """Features and matches in the files of hloc (github.com/cvg/Hierarchical-Localization), read and written.
 
 ``features.h5`` has a group per image with ``keypoints`` (N,2), ``descriptors`` (D,N), ``scores`` (N,) and
-``image_size``; ``matches.h5`` has a group per pair with ``matches0`` (N0,), the row in the second image or
--1, and ``matching_scores0``; ``pairs.txt`` has two names a line. Its first pixel has its centre at (0, 0).
+``image_size``; other tools write ``keypoints`` (N,4) as COLMAP has them. ``matches.h5`` has a group per pair
+with ``matches0`` (N0,), the row in the second image or -1, and ``matching_scores0``; ``pairs.txt`` has two
+names a line. hloc's first pixel has its centre at (0, 0).
 """
 
 from collections.abc import Iterable, Iterator
@@ -22,6 +23,8 @@ CENTER_SHIFT = np.float32(0.5)
 # old versions joined the names of a pair by another sign
 JOINTS = ("/", "_")
 UNMATCHED = -1
+# COLMAP's keypoints have two, four or six columns
+MOST_COLUMNS = 6
 
 
 def open_hloc(path: Path) -> h5py.File:
@@ -43,6 +46,8 @@ def open_hloc(path: Path) -> h5py.File:
 def read_hloc_features(file: h5py.File, name: str) -> dict[str, Array] | None:
     """One image's features; None where the file knows nothing of the image.
 
+    Four columns of keypoints are x, y, scale and angle, as in COLMAP; of others the first two are taken.
+
     Returns
     -------
     keypoints : (N,2) float32, the first pixel's centre at (.5, .5).
@@ -53,21 +58,37 @@ def read_hloc_features(file: h5py.File, name: str) -> dict[str, Array] | None:
 
     Raises
     ------
-    ConfigError : the image's arrays do not fit together.
+    ConfigError : the image's arrays do not fit together, or its keypoints are no rows of x and y.
     """
     group = _features_of(file, name)
     if group is None:
         return None
-    keypoints = group["keypoints"][()].astype(np.float32).reshape(-1, 2)
-    count = len(keypoints)
+    rows = group["keypoints"][()].astype(np.float32)
+    if rows.size == 0:
+        rows = np.zeros((0, 2), np.float32)
+    if rows.ndim != 2 or not 2 <= rows.shape[1] <= MOST_COLUMNS:
+        raise ConfigError(
+            f"{file.filename} has keypoints of '{name}' of shape {rows.shape}, which are no rows of x and "
+            "y: write it again with hloc."
+        )
+    count = len(rows)
+    none = np.zeros((0, count))
+    scales, angles = rows[:, 2:].T if rows.shape[1] == 4 else (np.ones(count), np.zeros(count))
+    if "oris" in group:
+        angles = np.deg2rad(group["oris"][()].ravel())
+    # where there is no keypoint, tools write descriptors of any shape
+    descriptors = _optional(group, "descriptors", none) if count else none
+    # what half precision cannot hold becomes infinite, which is told where it is read
+    with np.errstate(over="ignore"):
+        descriptors = descriptors.astype(np.float16)
     found = {
-        "keypoints": keypoints + CENTER_SHIFT,
-        "descriptors": _optional(group, "descriptors", np.zeros((0, count))).T.astype(np.float16),
+        "keypoints": rows[:, :2] + CENTER_SHIFT,
+        "descriptors": descriptors.T,
         "scores": _optional(group, "scores", np.ones(count)).ravel().astype(np.float32),
-        "scales": _optional(group, "scales", np.ones(count)).ravel().astype(np.float32),
-        "angles": np.deg2rad(_optional(group, "oris", np.zeros(count)).ravel()).astype(np.float32),
+        "scales": _optional(group, "scales", scales).ravel().astype(np.float32),
+        "angles": angles.astype(np.float32),
     }
-    if any(len(column) != count for column in found.values()):
+    if descriptors.ndim != 2 or any(len(column) != count for column in found.values()):
         raise ConfigError(
             f"{file.filename} has {count} keypoints of '{name}', but not as many descriptors or scores: "
             "write it again with hloc."
@@ -104,7 +125,8 @@ def descriptor_size(file: h5py.File) -> int:
     sizes: list[int] = []
 
     def visit(name: str, item: Any) -> int | None:
-        if isinstance(item, h5py.Dataset) and name.rpartition("/")[2] == "descriptors":
+        known = isinstance(item, h5py.Dataset) and name.rpartition("/")[2] == "descriptors"
+        if known and item.ndim == 2 and item.shape[0]:
             sizes.append(int(item.shape[0]))
         return sizes[0] if sizes else None
 
@@ -124,7 +146,7 @@ def read_hloc_matches(
 
     Raises
     ------
-    ConfigError : a row lies beyond the image's keypoints.
+    ConfigError : a row lies beyond the image's keypoints, or there are not as many scores.
     """
     for turned in (False, True):
         first, second = names[::-1] if turned else names
@@ -132,7 +154,12 @@ def read_hloc_matches(
             group = file.get(joint.join(name.replace("/", "-") for name in (first, second)))
             if isinstance(group, h5py.Group) and "matches0" in group:
                 partners = group["matches0"][()].astype(np.int64).ravel()
-                scores = _optional(group, "matching_scores0", np.ones(len(partners)))
+                scores = _optional(group, "matching_scores0", np.ones(len(partners))).ravel()
+                if len(scores) != len(partners):
+                    raise ConfigError(
+                        f"{file.filename} has {len(partners)} matches0 of '{names[0]}' and '{names[1]}', "
+                        f"but {len(scores)} matching_scores0: write it again with hloc."
+                    )
                 rows = np.flatnonzero(partners != UNMATCHED)
                 pairs = np.column_stack([rows, partners[rows]])
                 values = scores[rows].astype(np.float32)

@@ -152,9 +152,31 @@ class ImportedKeypoints:
         if columns is None:
             print(f"warning: {self._file.filename} has no keypoints of '{name}'")
             return KeypointSet.empty(self.descriptor_size, self.descriptor_dtype)
+        columns["descriptors"] = self._of_one_length(columns["descriptors"], name)
         found_in = read_hloc_size(self._file, name) or size
-        points = KeypointSet(**columns, image_size=found_in)
+        points = KeypointSet(
+            columns["keypoints"],
+            columns["descriptors"],
+            columns["scores"],
+            columns["scales"],
+            columns["angles"],
+            found_in,
+        )
         return points if found_in == size else self._scaled(points, name, size)
+
+    def _of_one_length(self, descriptors: Array, name: str) -> Array:
+        """The descriptors (N,D) of an image, zeros where the other images alone have some."""
+        count, length = descriptors.shape
+        if length == self.descriptor_size:
+            return descriptors
+        if length:
+            raise ConfigError(
+                f"{self._file.filename} has descriptors of {length} numbers of '{name}', but of "
+                f"{self.descriptor_size} of other images: give the features of one detector."
+            )
+        if count:
+            print(f"warning: {self._file.filename} has no descriptors of '{name}'; zeros take their place")
+        return np.zeros((count, self.descriptor_size), self.descriptor_dtype)
 
     def _scaled(self, points: KeypointSet, name: str, size: tuple[int, int]) -> KeypointSet:
         """Keypoints of an image that hloc saw in another size, in the image's own pixels."""
@@ -162,14 +184,14 @@ class ImportedKeypoints:
         x, y = (own / other for own, other in zip(size, points.image_size, strict=True))
         if abs(x / y - 1) > ASPECT_TOLERANCE:
             raise ConfigError(
-                f"{self._file.filename} has the keypoints of '{name}' in an image of {seen} pixels, but here "
-                f"it has {here}, as the file stores it: give the image that hloc saw, or let hloc read this "
-                "one, without turning it as EXIF says."
+                f"{self._file.filename} has the keypoints of '{name}' in an image of {seen} pixels, but "
+                f"its file here stores {here}: give the image that hloc saw, or let hloc read this one, "
+                "without turning it as EXIF says."
             )
         if not self._told_of_scaling:
             print(
-                f"keypoints of {self._file.filename} are scaled to the size of the images here: '{name}' had "
-                f"{seen} pixels and has {here}"
+                f"keypoints of {self._file.filename} are scaled to the size of the images here: "
+                f"'{name}' had {seen} pixels and has {here}"
             )
         self._told_of_scaling = True
         return points.scaled(x, y)

@@ -84,7 +84,7 @@ def test_keypoints_of_larger_or_smaller_photographs_are_scaled(extract, capsys, 
 
 @pytest.mark.parametrize("seen", [(HEIGHT, WIDTH), (WIDTH, HEIGHT - 10), (2 * WIDTH, HEIGHT)])
 def test_keypoints_of_a_photograph_with_another_aspect_are_refused(extract, seen):
-    words = rf"'a\.png' in an image of {seen[0]} x {seen[1]} pixels, but here it has {WIDTH} x {HEIGHT}"
+    words = rf"'a\.png' in an image of {seen[0]} x {seen[1]} pixels, but .* stores {WIDTH} x {HEIGHT}"
     with pytest.raises(ConfigError, match=words):
         extract({"a.png": keypoints(image_size=seen)})
 
@@ -93,3 +93,20 @@ def test_keypoints_of_a_photograph_with_another_aspect_are_refused(extract, seen
 def test_an_image_size_that_is_none_is_refused(extract, seen):
     with pytest.raises(ConfigError, match=r"image_size of 'a\.png' that is no width and height"):
         extract({"a.png": keypoints(image_size=seen)})
+
+
+def test_images_without_descriptors_or_keypoints_go_with_the_others(extract, capsys):
+    bare = {"keypoints": keypoints(4)["keypoints"]}
+    nothing = {"keypoints": np.zeros((0, 2)), "descriptors": np.zeros(0)}
+    found = extract({"a.png": bare, "b.png": keypoints(), "c.png": nothing})
+    assert found.offsets.tolist() == [0, 4, 9, 9] and found.descriptors.shape == (9, 16)
+    assert not found.descriptors[:4].any()
+    np.testing.assert_allclose(found.descriptors[4:], keypoints()["descriptors"].T, atol=1e-2)
+    warnings = [line for line in capsys.readouterr().out.splitlines() if line.startswith("warning")]
+    assert len(warnings) == 1 and "has no descriptors of 'a.png'" in warnings[0]
+
+
+def test_descriptors_of_two_lengths_are_refused(extract):
+    other = keypoints(descriptors=np.ones((32, 5)))
+    with pytest.raises(ConfigError, match=r"of 32 numbers of 'b\.png', but of 16 of other images"):
+        extract({"a.png": keypoints(), "b.png": other})
