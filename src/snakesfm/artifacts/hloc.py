@@ -1,9 +1,9 @@
 """Features and matches in the files of hloc (github.com/cvg/Hierarchical-Localization), read and written.
 
 ``features.h5`` has a group per image with ``keypoints`` (N,2), ``descriptors`` (D,N), ``scores`` (N,) and
-``image_size``; other tools write ``keypoints`` (N,4) as COLMAP has them. ``matches.h5`` has a group per pair
-with ``matches0`` (N0,), the row in the second image or -1, and ``matching_scores0``; ``pairs.txt`` has two
-names a line. hloc's first pixel has its centre at (0, 0).
+``image_size``; other tools write ``keypoints`` (N,4) as COLMAP has them. ``matches.h5`` has a group per
+pair with ``matches0`` (N0,), the row in the second image or -1, and ``matching_scores0``; ``pairs.txt`` has
+two names a line. hloc's first pixel has its centre at (0, 0).
 """
 
 from collections.abc import Iterable, Iterator

@@ -2,7 +2,7 @@
 
 import hashlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -231,7 +231,8 @@ def _extract(
             points.scaled(image.reduction, image.reduction)
             for points, image in zip(reduced, pixels.values(), strict=True)
         ]
-    for (place, image), points in zip(pixels.items(), found, strict=True):
+    for (place, image), gapped in zip(pixels.items(), found, strict=True):
+        points = _without_gaps(gapped, images[place][0])
         colors = sample_colors(image.rgb, points.keypoints / image.reduction)
         results[place] = ColoredKeypoints(points, colors)
     return results
@@ -243,6 +244,20 @@ def _read_known(
     """The known keypoints of an image, but for those that its mask hides."""
     points = source.read(name, size)
     return points if mask is None else points.unmasked(mask, *size)
+
+
+def _without_gaps(points: KeypointSet, name: str) -> KeypointSet:
+    """Keypoints with zeros for descriptors that are not finite; none is dropped, as matches count them."""
+    gaps = ~np.isfinite(points.descriptors).all(axis=1)
+    if not gaps.any():
+        return points
+    print(
+        f"warning: {gaps.sum()} of {len(points)} descriptors of '{name}' are not finite; zeros take their "
+        "place"
+    )
+    descriptors = points.descriptors.copy()
+    descriptors[gaps] = 0
+    return replace(points, descriptors=descriptors)
 
 
 def _read_former(path: Path, wanted: set[str]) -> Mapping[str, ColoredKeypoints]:

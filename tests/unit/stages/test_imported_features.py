@@ -8,7 +8,10 @@ import pytest
 from snakesfm.artifacts import Header, ImageIndex, LocalFeatures
 from snakesfm.config.extract_features import ExtractFeaturesOptions
 from snakesfm.errors import ConfigError
+from snakesfm.features.keypoints import KeypointSet
 from snakesfm.geometry.camera import PARAM_SLOTS
+from snakesfm.matching.matcher import create_matcher
+from snakesfm.retrieval.vlad import describe_vlad
 from snakesfm.stages import extract_features
 from snakesfm.stages.job import StageJob
 
@@ -110,3 +113,37 @@ def test_descriptors_of_two_lengths_are_refused(extract):
     other = keypoints(descriptors=np.ones((32, 5)))
     with pytest.raises(ConfigError, match=r"of 32 numbers of 'b\.png', but of 16 of other images"):
         extract({"a.png": keypoints(), "b.png": other})
+
+
+def test_descriptors_that_are_not_finite_become_zeros_and_harm_neither_matching_nor_retrieval(
+    extract, capsys
+):
+    rng = np.random.default_rng(1)
+    own = rng.normal(size=(16, 300))
+    broken = own + rng.normal(scale=0.01, size=own.shape)
+    # the last is too large for half precision
+    broken[3, 5], broken[:, 7], broken[0, 11] = np.nan, np.inf, 1e6
+    places = np.tile([[9.0, 9.0]], (300, 1))
+    found = extract(
+        {
+            "a.png": {"keypoints": places, "descriptors": own},
+            "b.png": {"keypoints": places, "descriptors": broken},
+        }
+    )
+    warnings = [line for line in capsys.readouterr().out.splitlines() if line.startswith("warning")]
+    assert len(warnings) == 1 and "3 of 300 descriptors of 'b.png' are not finite" in warnings[0]
+    first, second = found.descriptors[:300], found.descriptors[300:]
+    assert np.flatnonzero(~second.any(axis=1)).tolist() == [5, 7, 11] and np.isfinite(second).all()
+    assert first.dtype == np.float16
+    whole = [row for row in range(300) if row not in (5, 7, 11)]
+    for one, other in ((first, second), (second, first)):
+        matcher = create_matcher("mutual_ratio", max_ratio=0.8, search="clustered", words=32, probes=3.0)
+        prepared = [
+            KeypointSet(places, rows, places[:, 0], places[:, 0], places[:, 0]) for rows in (one, other)
+        ]
+        matches, _ = matcher.match(matcher.prepare(prepared[0]), matcher.prepare_second(prepared[1]))
+        same = matches[:, 0] == matches[:, 1]
+        assert set(matches[same, 0].tolist()) == set(whole) and (~same).sum() <= 3
+    centers = first[:8].astype(np.float32)
+    vectors = [describe_vlad(rows, centers, 0.5) for rows in (first, second)]
+    assert 0.9 < vectors[0] @ vectors[1] <= 1.001
