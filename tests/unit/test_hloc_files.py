@@ -7,9 +7,11 @@ import pytest
 from snakesfm.artifacts.hloc import (
     clashing_names,
     descriptor_size,
+    estimate_hloc_pairs,
     open_hloc,
     read_hloc_features,
     read_hloc_matches,
+    read_hloc_pairs,
     write_hloc_features,
     write_hloc_matches,
 )
@@ -161,3 +163,35 @@ def test_matches_with_a_leading_axis_are_read_and_too_few_scores_refused(tmp_pat
     assert matches.tolist() == [[1, 2], [2, 0]] and values.tolist() == [0.5, 0.25]
     with pytest.raises(ConfigError, match=r"3 matches0 of 'a\.jpg' and 'c\.jpg', but 2 matching_scores0"):
         read_hloc_matches(file, ("a.jpg", "c.jpg"), (3, 3))
+
+
+@pytest.mark.parametrize("joint", ["/", "_"])
+def test_pairs_are_those_that_the_matches_are_of(tmp_path, joint):
+    names = ["s/a_1.jpg", "b.jpg", "b_2.jpg", "s-a_1.jpg", "c.jpg"]
+    stored = [("s-a_1.jpg", "b_2.jpg"), ("c.jpg", "b.jpg"), ("b.jpg", "b_2.jpg"), ("b.jpg", "gone_3.jpg")]
+    path = tmp_path / "matches.h5"
+    with h5py.File(path, "w") as file:
+        for pair in stored:
+            file[f"{joint.join(pair)}/matches0"] = np.array([0])
+            file[f"{joint.join(pair)}/matching_scores0"] = np.array([1.0])
+        file["notes"] = np.zeros(3)
+    file = open_hloc(path)
+    pairs, others = read_hloc_pairs(file, names)
+    # two images have one name in hloc's files, which cannot tell whose matches these are
+    assert sorted(map(tuple, pairs.tolist())) == [(0, 2), (1, 2), (3, 2), (4, 1)] and others == 1
+    assert all(read_hloc_matches(file, (names[i], names[j]), (1, 1)) is not None for i, j in pairs)
+    assert 3 <= estimate_hloc_pairs(file) <= 6
+    assert len(read_hloc_pairs(file, ["x.jpg"])[0]) == 0
+
+
+@pytest.mark.parametrize("joint", ["/", "_"])
+def test_the_number_of_pairs_is_estimated_from_some(tmp_path, joint):
+    with h5py.File(tmp_path / "matches.h5", "w", libver="latest") as file:
+        for i in range(300):
+            for j in range(i + 1, min(i + 1 + i % 11, 300)):
+                file[joint.join((f"{i:03}.jpg", f"{j:03}.jpg")) + "/matches0"] = np.zeros(1, np.int8)
+        pairs, _ = read_hloc_pairs(file, [f"{i:03}.jpg" for i in range(300)])
+        assert len(pairs) == 1470
+        assert 1300 < estimate_hloc_pairs(file) < 1650
+    with h5py.File(tmp_path / "empty.h5", "w") as file:
+        assert estimate_hloc_pairs(file) == 0 and read_hloc_pairs(file, ["a", "b"])[1] == 0

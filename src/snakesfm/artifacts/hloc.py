@@ -6,7 +6,8 @@ pair with ``matches0`` (N0,), the row in the second image or -1, and ``matching_
 two names a line. hloc's first pixel has its centre at (0, 0).
 """
 
-from collections.abc import Iterable, Iterator
+import itertools
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,8 @@ CENTER_SHIFT = np.float32(0.5)
 # old versions joined the names of a pair by another sign
 JOINTS = ("/", "_")
 UNMATCHED = -1
+# groups that are opened while the Snakefile is parsed: some milliseconds
+LOOKS = 100
 # COLMAP's keypoints have two, four or six columns
 MOST_COLUMNS = 6
 
@@ -132,6 +135,54 @@ def descriptor_size(file: h5py.File) -> int:
 
     file.visititems(visit)
     return sizes[0] if sizes else 0
+
+
+def read_hloc_pairs(file: h5py.File, names: Sequence[str]) -> tuple[Array, int]:
+    """The pairs of images that a file has matches of, however their names are joined.
+
+    Parameters
+    ----------
+    file : hloc's matches.
+    names : N images.
+
+    Returns
+    -------
+    pairs : (P,2) int64 rows of ``names``, in the order of the file, maybe some twice or turned.
+    others : how many pairs have an image that is not among the names.
+    """
+    rows: dict[str, list[int]] = {}
+    for row, name in enumerate(names):
+        rows.setdefault(name.replace("/", "-"), []).append(row)
+    pairs: list[tuple[int, int]] = []
+    others = 0
+    for outer, group in file.items():
+        if not isinstance(group, h5py.Group):
+            continue
+        for joined in _joined_names(outer, group):
+            found = next((both for both in joined if both[0] in rows and both[1] in rows), None)
+            if found is None:
+                others += 1
+            else:
+                pairs += itertools.product(rows[found[0]], rows[found[1]])
+    return np.array(pairs, np.int64).reshape(-1, 2), others
+
+
+def _joined_names(outer: str, group: h5py.Group) -> Iterator[list[tuple[str, str]]]:
+    """Of each pair in one of a file's groups, the names that it may be of."""
+    if "matches0" in group:
+        # an old version's: names may hold the joint as well
+        places = [place for place, sign in enumerate(outer) if sign == JOINTS[1]]
+        yield [(outer[:place], outer[place + 1 :]) for place in places]
+    else:
+        yield from ([(outer, inner)] for inner in group)
+
+
+def estimate_hloc_pairs(file: h5py.File) -> int:
+    """About how many pairs a file has matches of, by a look at some of its groups."""
+    names = list(file)
+    groups = [file[name] for name in names[:: len(names) // LOOKS + 1]]
+    counts = [1 if "matches0" in group else len(group) for group in groups if isinstance(group, h5py.Group)]
+    return round(len(names) * sum(counts) / max(1, len(groups)))
 
 
 def read_hloc_matches(
