@@ -129,6 +129,9 @@ def test_virtual_and_imported_ask_for_what_they_read(tmp_path: Path) -> None:
         plan_of(tmp_path, front_end="virtual")
     with pytest.raises(ConfigError, match="imported=DIR"):
         plan_of(tmp_path, front_end="imported")
+    (tmp_path / "features.h5").write_bytes(b"features")
+    with pytest.raises(ConfigError, match=r"features\.h5', given as imported= .* is no folder"):
+        plan_of(tmp_path, front_end="imported", imported=str(tmp_path / "features.h5"))
     folder = tmp_path / "hloc"
     folder.mkdir()
     (folder / "pairs.txt").write_text("0.jpg 1.jpg\n")
