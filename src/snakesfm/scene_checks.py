@@ -87,6 +87,11 @@ def _check_given_files(scene: ScenePlan) -> None:
             f"'{scene.inputs.pairs}', given as pairs= for scene '{scene.name}', is no file: "
             "name the text file with two image names per line."
         )
+    if scene.inputs.imported and not Path(scene.inputs.imported).expanduser().is_dir():
+        raise ConfigError(
+            f"'{scene.inputs.imported}', given as imported= for scene '{scene.name}', is no folder: "
+            "name the folder that holds hloc's features.h5 and matches.h5."
+        )
 
 
 def _check_masks(scene: ScenePlan) -> None:

@@ -26,6 +26,7 @@ from snakesfm.front_ends import (
     needed_weights,
 )
 from snakesfm.ingest.discover import count_images, fingerprint_images
+from snakesfm.pair_lists import estimate_pair_count, find_pair_list, pair_list_state
 from snakesfm.resources import Load, job_load
 
 SCENE_ARTIFACTS = (
@@ -101,10 +102,9 @@ class ScenePlan:
 
     @property
     def pairs_file(self) -> str:
-        """The list of pairs that is given, or that comes with imported matches; "" for none."""
-        beside = Path(self.inputs.imported).expanduser() / "pairs.txt"
-        if not self.inputs.pairs and self.method("match_pairs") == "imported" and beside.is_file():
-            return str(beside)
+        """The list of pairs that is given, or comes with imported matches, or these; "" for none."""
+        if not self.inputs.pairs and self.method("match_pairs") == "imported":
+            return find_pair_list(Path(self.inputs.imported).expanduser())
         return self.inputs.pairs
 
     def options(self, stage: str) -> StageOptions:
@@ -240,11 +240,8 @@ class ScenePlan:
     @functools.cached_property
     def proposed_pair_count(self) -> int:
         """Most pairs that the method of select_pairs proposes, as far as is known before anything runs."""
-        listed = 0
-        if self.select_pairs.method == "listed":
-            listed = len(
-                Path(self.pairs_file).expanduser().read_text("utf-8", errors="replace").splitlines()
-            )
+        follows = self.select_pairs.method == "listed"
+        listed = estimate_pair_count(self.pairs_file) if follows else 0
         return self.select_pairs.count_proposed(self.image_count, listed)
 
     @property
@@ -348,7 +345,7 @@ class ScenePlan:
             return {
                 "blocks": self.blocks,
                 "pairs_file": self.pairs_file,
-                "pairs_content": file_digest(self.pairs_file),
+                "pairs_content": pair_list_state(self.pairs_file),
             }
         if stage == "adjust_bundle":
             model = self.configuration.index_images.camera_model

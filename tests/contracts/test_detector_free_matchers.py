@@ -9,6 +9,7 @@ from contracts.test_detectors import shapes
 from snakesfm.evaluation.colmap_model import read_model
 from snakesfm.features.virtual import VirtualKeypoints
 from snakesfm.matching.detector_free import DETECTOR_FREE_MATCHERS, Picture, create_detector_free
+from snakesfm.matching.loftr import shrink
 from snakesfm.synthetic.render_demo import make_demo
 from snakesfm.synthetic.scene import DemoOptions
 
@@ -90,6 +91,34 @@ class TestLoftr(DetectorFreeContract):
         coordinates, _ = self.match(matcher, picture(gray, "a", 3), picture(gray, "b", 2))
         assert len(expected) > 5
         np.testing.assert_allclose(coordinates, expected * [3, 3, 2, 2], rtol=1e-5)
+
+    @pytest.mark.parametrize(
+        ("shape", "side", "seen"),
+        [
+            # of longer side 840, but for a panorama
+            ((3000, 4000), 840, (624, 840)),
+            ((1000, 16_000), 840, (64, 1024)),
+            ((1640, 101), 840, (1032, 64)),
+            ((480, 640), 64, (64, 80)),
+            ((64, 900), 128, (64, 896)),
+            ((63, 900), 128, None),
+        ],
+    )
+    def test_the_shorter_side_keeps_what_the_network_needs(self, shape, side, seen):
+        gray = np.zeros(shape, np.uint8)
+        gray[0, 0] = 1
+        small = shrink(picture(gray, "long"), side, 8)
+        if seen is None:
+            assert small.gray is None
+            return
+        assert small.gray.shape == seen
+        np.testing.assert_allclose(small.ratios * seen[::-1], shape[::-1])
+
+    def test_long_images_are_matched(self, matcher):
+        long = picture(shapes(960, 70)[0], "long")
+        coordinates, _ = self.match(matcher, long, long)
+        assert len(coordinates) > 5 and coordinates[:, 0].max() > 480
+        assert (coordinates >= 0).all() and (coordinates < [960, 70, 960, 70]).all()
 
     def test_the_first_place_is_a_corner_of_a_coarse_cell(self, matcher, pictures):
         coordinates, _ = self.match(matcher, pictures[0], pictures[2])

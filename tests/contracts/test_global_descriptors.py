@@ -43,7 +43,9 @@ class GlobalDescriptorContract:
         assert self.method in DESCRIPTORS
         assert descriptor.multiple >= 1 and descriptor.usual_side_px >= 28
 
-    @pytest.mark.parametrize("shape", [(96, 70), (70, 96), (33, 131), (28, 28)])
+    @pytest.mark.parametrize(
+        "shape", [(96, 70), (70, 96), (33, 131), (28, 28), (960, 32), (20, 700), (300, 9)]
+    )
     def test_vectors_are_of_unit_length(self, descriptor, shape):
         vector = describe(descriptor, colored(*shape), 112)
         assert vector.shape == (descriptor.size,) and vector.dtype == np.float32

@@ -35,6 +35,15 @@ from snakesfm.errors import ConfigError
             ["key 'extract_features': surface_points and view_points", "set one of them to 0."],
         ),
         (
+            {"calibrate_cameras": {"min_focal_ratio": 7}},
+            ["key 'calibrate_cameras': min_focal_ratio 7 must be below max_focal_ratio 6"],
+        ),
+        ({"calibrate_cameras": {"max_focal_ratio": 0.4}}, ["min_focal_ratio 0.4 must be below"]),
+        ({"select_pairs": {"top_k": -1}}, ["select_pairs.top_k' = -1", "to 1 (or 'auto')."]),
+        ({"select_pairs": {"top_k": 0}}, ["select_pairs.top_k' = 0", "to 1 (or 'auto')."]),
+        ({"select_pairs": {"top_k": 100_001}}, ["select_pairs.top_k", "or equal to 100000"]),
+        ({"extract_features": {"edge_threshold": 1.0}}, ["edge_threshold' = 1.0", "greater than 1."]),
+        (
             {"adjust_bundle": {"refine_finenesses": [2.0, 1.0]}},
             ["key 'adjust_bundle': refine_finenesses must ascend"],
         ),
@@ -47,6 +56,17 @@ def test_a_wrong_key_or_value_gives_one_sentence_that_names_it(values: dict, par
     assert "\n" not in message
     for part in parts:
         assert part in message
+
+
+def test_values_at_the_edge_of_their_range_are_taken() -> None:
+    load_configuration(
+        {
+            "calibrate_cameras": {"min_focal_ratio": 5.9},
+            "select_pairs": {"top_k": 1},
+            "extract_features": {"edge_threshold": 1.01},
+        }
+    )
+    load_configuration({"select_pairs": {"top_k": 100_000}})
 
 
 def test_scene_takes_the_name_of_its_folder_or_of_its_parent() -> None:

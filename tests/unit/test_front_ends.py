@@ -5,6 +5,8 @@ import typing
 from pathlib import Path
 from typing import Any
 
+import h5py
+import numpy as np
 import pytest
 
 from snakesfm.config.configuration import STAGES, FrontEndName, options_class
@@ -24,7 +26,7 @@ from snakesfm.matching.detector_free import DETECTOR_FREE_MATCHERS
 from snakesfm.matching.matcher import MATCHERS
 from snakesfm.plan import Plan
 from snakesfm.retrieval.descriptor import DESCRIPTORS
-from snakesfm.scene_plan import STAGES_IN_DETECTOR_PIXELS
+from snakesfm.scene_plan import STAGES_IN_DETECTOR_PIXELS, ScenePlan
 
 
 def plan_of(tmp_path: Path, **config: object) -> Plan:
@@ -127,6 +129,9 @@ def test_virtual_and_imported_ask_for_what_they_read(tmp_path: Path) -> None:
         plan_of(tmp_path, front_end="virtual")
     with pytest.raises(ConfigError, match="imported=DIR"):
         plan_of(tmp_path, front_end="imported")
+    (tmp_path / "features.h5").write_bytes(b"features")
+    with pytest.raises(ConfigError, match=r"features\.h5', given as imported= .* is no folder"):
+        plan_of(tmp_path, front_end="imported", imported=str(tmp_path / "features.h5"))
     folder = tmp_path / "hloc"
     folder.mkdir()
     (folder / "pairs.txt").write_text("0.jpg 1.jpg\n")
@@ -135,6 +140,43 @@ def test_virtual_and_imported_ask_for_what_they_read(tmp_path: Path) -> None:
     before = scene.params("match_pairs", {"tile": "0-0"}, True)
     (folder / "matches.h5").write_bytes(b"matches")
     assert before != scene.params("match_pairs", {"tile": "0-0"}, True)
+
+
+def test_imported_matches_without_a_list_are_the_list(tmp_path: Path) -> None:
+    folder = tmp_path / "hloc"
+    folder.mkdir()
+    config: dict[str, Any] = {
+        "front_end": "imported",
+        "imported": str(folder),
+        "select_pairs": {"exhaustive_up_to": 2},
+    }
+
+    def plan() -> ScenePlan:
+        (scene,) = plan_of(tmp_path, **config).scenes.values()
+        return scene
+
+    assert plan().select_pairs.method == "sequential+retrieval"
+    matches = folder / "matches.h5"
+    matches.write_bytes(b"no HDF5 file")
+    # the job says so, in one sentence
+    assert plan().pair_count == 0
+    with h5py.File(matches, "w") as file:
+        for pair in ("0.jpg/2.jpg", "1.jpg/2.jpg"):
+            file[f"{pair}/matches0"] = np.zeros(1, int)
+    scene = plan()
+    assert scene.select_pairs.method == "listed" and scene.pairs_file == str(matches)
+    assert scene.proposed_pair_count == scene.pair_count == 2
+    before = scene.params("select_pairs", {}, True)
+    with h5py.File(matches, "a") as file:
+        file["0.jpg/1.jpg/matches0"] = np.zeros(1, int)
+    assert before != plan().params("select_pairs", {}, True)
+    (folder / "pairs.txt").write_text("0.jpg 1.jpg\n")
+    assert plan().pairs_file == str(folder / "pairs.txt") and plan().pair_count == 1
+    config["pairs"] = str(tmp_path / "own.txt")
+    (tmp_path / "own.txt").write_text("0.jpg 2.jpg\n")
+    assert plan().pairs_file == config["pairs"]
+    config |= {"pairs": "", "select_pairs": {"method": "exhaustive"}}
+    assert plan().select_pairs.method == "exhaustive"
 
 
 def test_without_keypoints_the_stages_after_matching_read_merged_ones(tmp_path: Path) -> None:

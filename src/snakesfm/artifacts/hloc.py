@@ -1,11 +1,13 @@
 """Features and matches in the files of hloc (github.com/cvg/Hierarchical-Localization), read and written.
 
 ``features.h5`` has a group per image with ``keypoints`` (N,2), ``descriptors`` (D,N), ``scores`` (N,) and
-``image_size``; ``matches.h5`` has a group per pair with ``matches0`` (N0,), the row in the second image or
--1, and ``matching_scores0``; ``pairs.txt`` has two names a line. Its first pixel has its centre at (0, 0).
+``image_size``; other tools write ``keypoints`` (N,4) as COLMAP has them. ``matches.h5`` has a group per
+pair with ``matches0`` (N0,), the row in the second image or -1, and ``matching_scores0``; ``pairs.txt`` has
+two names a line. hloc's first pixel has its centre at (0, 0).
 """
 
-from collections.abc import Iterable, Iterator
+import itertools
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +24,10 @@ CENTER_SHIFT = np.float32(0.5)
 # old versions joined the names of a pair by another sign
 JOINTS = ("/", "_")
 UNMATCHED = -1
+# groups that are opened while the Snakefile is parsed: some milliseconds
+LOOKS = 100
+# COLMAP's keypoints have two, four or six columns
+MOST_COLUMNS = 6
 
 
 def open_hloc(path: Path) -> h5py.File:
@@ -43,6 +49,8 @@ def open_hloc(path: Path) -> h5py.File:
 def read_hloc_features(file: h5py.File, name: str) -> dict[str, Array] | None:
     """One image's features; None where the file knows nothing of the image.
 
+    Four columns of keypoints are x, y, scale and angle, as in COLMAP; of others the first two are taken.
+
     Returns
     -------
     keypoints : (N,2) float32, the first pixel's centre at (.5, .5).
@@ -53,21 +61,37 @@ def read_hloc_features(file: h5py.File, name: str) -> dict[str, Array] | None:
 
     Raises
     ------
-    ConfigError : the image's arrays do not fit together.
+    ConfigError : the image's arrays do not fit together, or its keypoints are no rows of x and y.
     """
-    group = file.get(name)
-    if not isinstance(group, h5py.Group) or "keypoints" not in group:
+    group = _features_of(file, name)
+    if group is None:
         return None
-    keypoints = group["keypoints"][()].astype(np.float32).reshape(-1, 2)
-    count = len(keypoints)
+    rows = group["keypoints"][()].astype(np.float32)
+    if rows.size == 0:
+        rows = np.zeros((0, 2), np.float32)
+    if rows.ndim != 2 or not 2 <= rows.shape[1] <= MOST_COLUMNS:
+        raise ConfigError(
+            f"{file.filename} has keypoints of '{name}' of shape {rows.shape}, which are no rows of x and "
+            "y: write it again with hloc."
+        )
+    count = len(rows)
+    none = np.zeros((0, count))
+    scales, angles = rows[:, 2:].T if rows.shape[1] == 4 else (np.ones(count), np.zeros(count))
+    if "oris" in group:
+        angles = np.deg2rad(group["oris"][()].ravel())
+    # where there is no keypoint, tools write descriptors of any shape
+    descriptors = _optional(group, "descriptors", none) if count else none
+    # what half precision cannot hold becomes infinite, which is told where it is read
+    with np.errstate(over="ignore"):
+        descriptors = descriptors.astype(np.float16)
     found = {
-        "keypoints": keypoints + CENTER_SHIFT,
-        "descriptors": _optional(group, "descriptors", np.zeros((0, count))).T.astype(np.float16),
+        "keypoints": rows[:, :2] + CENTER_SHIFT,
+        "descriptors": descriptors.T,
         "scores": _optional(group, "scores", np.ones(count)).ravel().astype(np.float32),
-        "scales": _optional(group, "scales", np.ones(count)).ravel().astype(np.float32),
-        "angles": np.deg2rad(_optional(group, "oris", np.zeros(count)).ravel()).astype(np.float32),
+        "scales": _optional(group, "scales", scales).ravel().astype(np.float32),
+        "angles": angles.astype(np.float32),
     }
-    if any(len(column) != count for column in found.values()):
+    if descriptors.ndim != 2 or any(len(column) != count for column in found.values()):
         raise ConfigError(
             f"{file.filename} has {count} keypoints of '{name}', but not as many descriptors or scores: "
             "write it again with hloc."
@@ -75,17 +99,90 @@ def read_hloc_features(file: h5py.File, name: str) -> dict[str, Array] | None:
     return found
 
 
+def read_hloc_size(file: h5py.File, name: str) -> tuple[int, int] | None:
+    """Width and height in pixels of the image that hloc found an image's keypoints in; None where not told.
+
+    Raises
+    ------
+    ConfigError : what is told is no size.
+    """
+    group = _features_of(file, name)
+    if group is None or "image_size" not in group:
+        return None
+    told = np.ravel(group["image_size"][()])
+    if len(told) != 2 or not (told >= 1).all():
+        raise ConfigError(
+            f"{file.filename} has an image_size of '{name}' that is no width and height: write it again "
+            "with hloc."
+        )
+    return int(told[0]), int(told[1])
+
+
+def _features_of(file: h5py.File, name: str) -> h5py.Group | None:
+    group = file.get(name)
+    return group if isinstance(group, h5py.Group) and "keypoints" in group else None
+
+
 def descriptor_size(file: h5py.File) -> int:
     """Length of the descriptors of the first image that has some; 0 where none has."""
     sizes: list[int] = []
 
     def visit(name: str, item: Any) -> int | None:
-        if isinstance(item, h5py.Dataset) and name.rpartition("/")[2] == "descriptors":
+        known = isinstance(item, h5py.Dataset) and name.rpartition("/")[2] == "descriptors"
+        if known and item.ndim == 2 and item.shape[0]:
             sizes.append(int(item.shape[0]))
         return sizes[0] if sizes else None
 
     file.visititems(visit)
     return sizes[0] if sizes else 0
+
+
+def read_hloc_pairs(file: h5py.File, names: Sequence[str]) -> tuple[Array, int]:
+    """The pairs of images that a file has matches of, however their names are joined.
+
+    Parameters
+    ----------
+    file : hloc's matches.
+    names : N images.
+
+    Returns
+    -------
+    pairs : (P,2) int64 rows of ``names``, in the order of the file, maybe some twice or turned.
+    others : how many pairs have an image that is not among the names.
+    """
+    rows: dict[str, list[int]] = {}
+    for row, name in enumerate(names):
+        rows.setdefault(name.replace("/", "-"), []).append(row)
+    pairs: list[tuple[int, int]] = []
+    others = 0
+    for outer, group in file.items():
+        if not isinstance(group, h5py.Group):
+            continue
+        for joined in _joined_names(outer, group):
+            found = next((both for both in joined if both[0] in rows and both[1] in rows), None)
+            if found is None:
+                others += 1
+            else:
+                pairs += itertools.product(rows[found[0]], rows[found[1]])
+    return np.array(pairs, np.int64).reshape(-1, 2), others
+
+
+def _joined_names(outer: str, group: h5py.Group) -> Iterator[list[tuple[str, str]]]:
+    """Of each pair in one of a file's groups, the names that it may be of."""
+    if "matches0" in group:
+        # an old version's: names may hold the joint as well
+        places = [place for place, sign in enumerate(outer) if sign == JOINTS[1]]
+        yield [(outer[:place], outer[place + 1 :]) for place in places]
+    else:
+        yield from ([(outer, inner)] for inner in group)
+
+
+def estimate_hloc_pairs(file: h5py.File) -> int:
+    """About how many pairs a file has matches of, by a look at some of its groups."""
+    names = list(file)
+    groups = [file[name] for name in names[:: len(names) // LOOKS + 1]]
+    counts = [1 if "matches0" in group else len(group) for group in groups if isinstance(group, h5py.Group)]
+    return round(len(names) * sum(counts) / max(1, len(groups)))
 
 
 def read_hloc_matches(
@@ -100,7 +197,7 @@ def read_hloc_matches(
 
     Raises
     ------
-    ConfigError : a row lies beyond the image's keypoints.
+    ConfigError : a row lies beyond the image's keypoints, or there are not as many scores.
     """
     for turned in (False, True):
         first, second = names[::-1] if turned else names
@@ -108,7 +205,12 @@ def read_hloc_matches(
             group = file.get(joint.join(name.replace("/", "-") for name in (first, second)))
             if isinstance(group, h5py.Group) and "matches0" in group:
                 partners = group["matches0"][()].astype(np.int64).ravel()
-                scores = _optional(group, "matching_scores0", np.ones(len(partners)))
+                scores = _optional(group, "matching_scores0", np.ones(len(partners))).ravel()
+                if len(scores) != len(partners):
+                    raise ConfigError(
+                        f"{file.filename} has {len(partners)} matches0 of '{names[0]}' and '{names[1]}', "
+                        f"but {len(scores)} matching_scores0: write it again with hloc."
+                    )
                 rows = np.flatnonzero(partners != UNMATCHED)
                 pairs = np.column_stack([rows, partners[rows]])
                 values = scores[rows].astype(np.float32)

@@ -1,8 +1,8 @@
 """Options of calibrate_cameras."""
 
-from typing import ClassVar
+from typing import ClassVar, Self
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from snakesfm.config.base import StageOptions
 
@@ -47,3 +47,12 @@ class CalibrateCamerasOptions(StageOptions):
 
     default_sigma: float = Field(default=0.5, gt=0, le=10)
     """Relative standard deviation of the default focal length, as a prior."""
+
+    @model_validator(mode="after")
+    def _refuse_an_empty_range(self) -> Self:
+        if self.min_focal_ratio >= self.max_focal_ratio:
+            raise ValueError(
+                f"min_focal_ratio {self.min_focal_ratio:g} must be below max_focal_ratio "
+                f"{self.max_focal_ratio:g}: lower the one or raise the other"
+            )
+        return self

@@ -33,7 +33,7 @@ class ExtractFeaturesOptions(StageOptions):
     upright: bool = False
     """Describe keypoints upright: more matches, but none between cameras turned about their axis."""
 
-    edge_threshold: float = Field(10.0, ge=1.0, le=100.0)
+    edge_threshold: float = Field(10.0, gt=1.0, le=100.0)
     """Largest ratio of principal curvatures of a SIFT keypoint; lower refuses more points on edges."""
 
     @model_validator(mode="after")

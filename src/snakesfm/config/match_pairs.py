@@ -40,7 +40,7 @@ class MatchPairsOptions(StageOptions):
     """Least confidence of a match that a network makes; 'auto' is 0.1, and 0.2 without keypoints."""
 
     longer_side_px: int = Field(840, ge=64, le=20_000)
-    """Longer side to which larger images are scaled down by a matcher without keypoints."""
+    """Longer side to which a matcher without keypoints has images scaled down; the shorter keeps 64."""
 
     spread_px: float = Field(2.0, ge=0.0, le=100.0)
     """How far from its point the oracle 'virtual_places' puts a place, along x and y."""

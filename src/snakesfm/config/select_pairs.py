@@ -35,7 +35,7 @@ class SelectPairsOptions(StageOptions):
     look_ahead: int = Field(10, ge=1, le=10_000)
     """How many following images, in the natural order of names, an image is paired with by 'sequential'."""
 
-    top_k: int | Literal["auto"] = "auto"
+    top_k: Annotated[int, Field(ge=1, le=100_000)] | Literal["auto"] = "auto"
     """Similar or near images that are proposed; 'auto' is 100 to look at, else 15, 30 from 500 images."""
 
     min_score: float = Field(0.0, ge=-1.0, le=1.0)

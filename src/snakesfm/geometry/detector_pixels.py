@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from snakesfm.front_ends import LONGER_SIDE, SHORTER_SIDE
+from snakesfm.front_ends import LEAST_SIDE_PX, LONGER_SIDE, SHORTER_SIDE
 from snakesfm.geometry.camera import Camera
 
 Array = NDArray[Any]
@@ -31,7 +31,8 @@ def detector_scales(sizes: Array, settings: Mapping[str, Any]) -> Array:
     if SHORTER_SIDE in settings:
         scales = np.maximum(1.0, sides.min(axis=1) / float(settings[SHORTER_SIDE]))
     elif LONGER_SIDE in settings:
-        scales = np.maximum(1.0, sides.max(axis=1) / float(settings[LONGER_SIDE]))
+        wanted = sides.max(axis=1) / float(settings[LONGER_SIDE])
+        scales = np.maximum(1.0, np.minimum(wanted, sides.min(axis=1) / LEAST_SIDE_PX))
     return scales
 
 

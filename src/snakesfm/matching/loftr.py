@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from snakesfm.front_ends import LEAST_SIDE_PX
 from snakesfm.learned.batches import equal_rows
 from snakesfm.learned.checkpoints import fill_network
 from snakesfm.learned.device import load_torch
@@ -15,9 +16,6 @@ from snakesfm.learned.pictures import to_array, to_tensor
 from snakesfm.matching.detector_free import Picture, no_coordinates
 
 Array = NDArray[Any]
-
-# smaller images leave nothing within the border that LoFTR ignores
-SMALLEST_SIDE_PX = 64
 
 
 @dataclass(frozen=True)
@@ -37,12 +35,17 @@ class PreparedPicture:
 
 
 def shrink(picture: Picture, longer_side_px: int, multiple: int) -> PreparedPicture:
-    """Scale a picture down to a longer side, and both sides to multiples; never up."""
+    """Scale a picture down to a longer side, and both sides to multiples; never up.
+
+    Long pictures stay longer, so that their shorter side keeps what the network needs to find something.
+    """
     height, width = picture.gray.shape
-    factor = min(1.0, longer_side_px / max(height, width))
-    columns, rows = (int(side * factor) // multiple * multiple for side in (width, height))
+    least = min(LEAST_SIDE_PX, height, width)
+    factor = min(1.0, max(longer_side_px / max(height, width), least / min(height, width)))
+    # the product may fall short of the least by rounding
+    columns, rows = (max(int(side * factor), least) // multiple * multiple for side in (width, height))
     ratios = np.array(picture.size) / [max(columns, 1), max(rows, 1)]
-    if min(columns, rows) < SMALLEST_SIDE_PX or picture.gray.min() == picture.gray.max():
+    if min(columns, rows) < LEAST_SIDE_PX or picture.gray.min() == picture.gray.max():
         return PreparedPicture(None, ratios)
     return PreparedPicture(cv2.resize(picture.gray, (columns, rows), interpolation=cv2.INTER_AREA), ratios)
 

@@ -29,6 +29,10 @@ class GlobalDescriptor(Protocol):
     def multiple(self) -> int:
         """Both sides of an image must be multiples of this."""
 
+    @property
+    def smallest_side_px(self) -> int:
+        """Shorter side below which long images are not scaled down: the network needs it."""
+
     def infer(self, images: Any) -> Any:
         """Descriptors (B,D) of images (B,3,H,W), float tensors in 0 .. 1, of any length."""
 
@@ -40,14 +44,15 @@ def describe_batch(descriptor: GlobalDescriptor, images: Sequence[Array], longer
     ----------
     descriptor : the network.
     images : B images, (H,W,3) uint8 of any sizes; those that become one size share their work.
-    longer_side_px : larger images are scaled down to this; both sides become multiples, at least one.
+    longer_side_px : larger images are scaled down to this, but for those that would become too narrow;
+        both sides become multiples, at least one.
 
     Returns
     -------
     (B,D) float32 of unit length; zeros for an image of one tone, which resembles none.
     """
     vectors = np.zeros((len(images), descriptor.size))
-    small = [_shrink(rgb, longer_side_px, descriptor.multiple) for rgb in images]
+    small = [_shrink(rgb, longer_side_px, descriptor) for rgb in images]
     for same in equal_rows([rgb.shape for rgb in small]):
         rows = [row for row in same if images[row].min() != images[row].max()]
         if rows:
@@ -59,13 +64,16 @@ def describe_batch(descriptor: GlobalDescriptor, images: Sequence[Array], longer
     return units
 
 
-def _shrink(rgb: Array, longer_side_px: int, multiple: int) -> Array:
-    """Scale an image down to a longer side, and both sides to the nearest multiples."""
+def _shrink(rgb: Array, longer_side_px: int, descriptor: GlobalDescriptor) -> Array:
+    """Scale an image down to a longer side, not too narrow, and both sides to the nearest multiples."""
     import cv2
 
     height, width = rgb.shape[:2]
-    factor = min(1.0, longer_side_px / max(height, width))
-    columns, rows = (max(1, round(side * factor / multiple)) * multiple for side in (width, height))
+    multiple, least = descriptor.multiple, descriptor.smallest_side_px
+    factor = min(1.0, max(longer_side_px / max(height, width), least / min(height, width)))
+    columns, rows = (
+        max(least, max(1, round(side * factor / multiple)) * multiple) for side in (width, height)
+    )
     small: Array = cv2.resize(rgb, (columns, rows), interpolation=cv2.INTER_AREA)
     return small
 

@@ -13,6 +13,8 @@ def listed_pairs(
 ) -> tuple[PairTable, int]:
     """Parse lines ``name0 name1``; names may hold spaces, a tab between the two always separates them.
 
+    Spaces are all that Unicode calls so, such as the no-break space that word processors put.
+
     Parameters
     ----------
     lines : of the file; empty ones and those that start with ``#`` (and name no image) are skipped.
@@ -54,7 +56,7 @@ def _split(text: str, rows: Mapping[str, int]) -> tuple[int, int] | None:
         return (rows[first], rows[second]) if first in rows and second in rows else None
     text = text.strip()
     for place in range(len(text) - 1, 0, -1):
-        if text[place] == " ":
+        if text[place].isspace():
             first, second = text[:place].rstrip(), text[place:].strip()
             if first in rows and second in rows:
                 return rows[first], rows[second]
@@ -72,7 +74,7 @@ def _explain(text: str, rows: Mapping[str, int], place: str) -> str:
             f"{place}: '{text}' does not split into two known image names: write them relative to the "
             "image folder, with a tab between them if they hold spaces."
         )
-    unknown = next(part.strip() for part in parts if part.strip() not in rows)
+    unknown = next((part.strip() for part in parts if part.strip() not in rows), text)
     near = difflib.get_close_matches(unknown, list(rows), 1)
     hint = f"did you mean '{near[0]}'?" if near else "names are relative to the image folder."
     return f"{place}: there is no image '{unknown}'; {hint}"

@@ -45,6 +45,7 @@ class MegalocDescriptor:
 
     usual_side_px = 322
     multiple = PATCH_PX
+    smallest_side_px = 1
 
     def __init__(self, state: Mapping[str, Any]) -> None:
         needed = [f"{BACKBONE}cls_token", f"{BACKBONE}pos_embed", "aggregator.linear.weight"]

@@ -26,6 +26,8 @@ class NetvladDescriptor:
 
     usual_side_px = 640
     multiple = 1
+    # four poolings halve both sides
+    smallest_side_px = 1 << (len(GROUPS) - 1)
 
     def __init__(self, state: Mapping[str, Any]) -> None:
         self._mean = state.get("mean")

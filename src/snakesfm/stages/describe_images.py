@@ -62,6 +62,7 @@ def _describe_pictures(job: StageJob, options: "DescribeImagesOptions") -> tuple
             image = image_ids[row]
             width, height = index.sizes[image].tolist()
             shorter = math.ceil(side * min(width, height) / max(width, height))
+            shorter = max(shorter, descriptor.smallest_side_px)
             try:
                 pixels = read_image(Path(job.settings["images"]) / str(index.names[image]), shorter)
                 pictures[row] = pixels.rgb

@@ -2,7 +2,7 @@
 
 import hashlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,10 +11,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from snakesfm.artifacts.features import LocalFeatures
-from snakesfm.artifacts.hloc import FEATURES, descriptor_size, open_hloc, read_hloc_features
+from snakesfm.artifacts.hloc import (
+    FEATURES,
+    descriptor_size,
+    open_hloc,
+    read_hloc_features,
+    read_hloc_size,
+)
 from snakesfm.artifacts.images import ImageIndex
 from snakesfm.digests import file_digest
-from snakesfm.errors import ImageError
+from snakesfm.errors import ConfigError, ImageError
 from snakesfm.features.extraction import create_detector, extract_keypoints, sample_colors
 from snakesfm.features.keypoints import Detector, KeypointSet, KeypointSource
 from snakesfm.ingest.masks import find_mask, read_mask
@@ -37,6 +43,8 @@ class ColoredKeypoints:
 
 
 REUSES_FORMER = True
+# the sides of a scaled image are whole pixels
+ASPECT_TOLERANCE = 0.01
 
 
 def run(job: StageJob) -> None:
@@ -46,7 +54,7 @@ def run(job: StageJob) -> None:
 
     Raises
     ------
-    ConfigError : a mask cannot be read, or does not show the whole of its image.
+    ConfigError : a mask cannot be read, or does not show the whole of its image; hloc's file does not fit.
     """
     cv2.setNumThreads(job.threads)
     options: ExtractFeaturesOptions = job.options
@@ -118,6 +126,8 @@ def _create_finder(job: StageJob, options: "ExtractFeaturesOptions") -> Detector
 class ImportedKeypoints:
     """The keypoints of a file that hloc wrote, all of them; an image that it lacks has none.
 
+    Where hloc saw an image in another size, its keypoints are scaled to the image that is here.
+
     Parameters
     ----------
     path : hloc's file of features.
@@ -129,21 +139,62 @@ class ImportedKeypoints:
     def __init__(self, path: Path) -> None:
         self._file = open_hloc(path)
         self.descriptor_size = descriptor_size(self._file)
+        self._told_of_scaling = False
 
     def read(self, name: str, size: tuple[int, int]) -> KeypointSet:
-        """See :class:`snakesfm.features.keypoints.KeypointSource`."""
+        """See :class:`snakesfm.features.keypoints.KeypointSource`.
+
+        Raises
+        ------
+        ConfigError : the image's arrays do not fit together, or hloc saw it with another aspect.
+        """
         columns = read_hloc_features(self._file, name)
         if columns is None:
             print(f"warning: {self._file.filename} has no keypoints of '{name}'")
             return KeypointSet.empty(self.descriptor_size, self.descriptor_dtype)
-        return KeypointSet(
+        columns["descriptors"] = self._of_one_length(columns["descriptors"], name)
+        found_in = read_hloc_size(self._file, name) or size
+        points = KeypointSet(
             columns["keypoints"],
             columns["descriptors"],
             columns["scores"],
             columns["scales"],
             columns["angles"],
-            size,
+            found_in,
         )
+        return points if found_in == size else self._scaled(points, name, size)
+
+    def _of_one_length(self, descriptors: Array, name: str) -> Array:
+        """The descriptors (N,D) of an image, zeros where the other images alone have some."""
+        count, length = descriptors.shape
+        if length == self.descriptor_size:
+            return descriptors
+        if length:
+            raise ConfigError(
+                f"{self._file.filename} has descriptors of {length} numbers of '{name}', but of "
+                f"{self.descriptor_size} of other images: give the features of one detector."
+            )
+        if count:
+            print(f"warning: {self._file.filename} has no descriptors of '{name}'; zeros take their place")
+        return np.zeros((count, self.descriptor_size), self.descriptor_dtype)
+
+    def _scaled(self, points: KeypointSet, name: str, size: tuple[int, int]) -> KeypointSet:
+        """Keypoints of an image that hloc saw in another size, in the image's own pixels."""
+        seen, here = ("{} x {}".format(*of) for of in (points.image_size, size))
+        x, y = (own / other for own, other in zip(size, points.image_size, strict=True))
+        if abs(x / y - 1) > ASPECT_TOLERANCE:
+            raise ConfigError(
+                f"{self._file.filename} has the keypoints of '{name}' in an image of {seen} pixels, but "
+                f"its file here stores {here}: give the image that hloc saw, or let hloc read this one, "
+                "without turning it as EXIF says."
+            )
+        if not self._told_of_scaling:
+            print(
+                f"keypoints of {self._file.filename} are scaled to the size of the images here: "
+                f"'{name}' had {seen} pixels and has {here}"
+            )
+        self._told_of_scaling = True
+        return points.scaled(x, y)
 
 
 def _digest(sha256: str, options: "ExtractFeaturesOptions", beside: str) -> str:
@@ -180,7 +231,8 @@ def _extract(
             points.scaled(image.reduction, image.reduction)
             for points, image in zip(reduced, pixels.values(), strict=True)
         ]
-    for (place, image), points in zip(pixels.items(), found, strict=True):
+    for (place, image), gapped in zip(pixels.items(), found, strict=True):
+        points = _without_gaps(gapped, images[place][0])
         colors = sample_colors(image.rgb, points.keypoints / image.reduction)
         results[place] = ColoredKeypoints(points, colors)
     return results
@@ -192,6 +244,20 @@ def _read_known(
     """The known keypoints of an image, but for those that its mask hides."""
     points = source.read(name, size)
     return points if mask is None else points.unmasked(mask, *size)
+
+
+def _without_gaps(points: KeypointSet, name: str) -> KeypointSet:
+    """Keypoints with zeros for descriptors that are not finite; none is dropped, as matches count them."""
+    gaps = ~np.isfinite(points.descriptors).all(axis=1)
+    if not gaps.any():
+        return points
+    print(
+        f"warning: {gaps.sum()} of {len(points)} descriptors of '{name}' are not finite; zeros take their "
+        "place"
+    )
+    descriptors = points.descriptors.copy()
+    descriptors[gaps] = 0
+    return replace(points, descriptors=descriptors)
 
 
 def _read_former(path: Path, wanted: set[str]) -> Mapping[str, ColoredKeypoints]:

@@ -18,7 +18,7 @@ from snakesfm.artifacts.images import ImageIndex
 from snakesfm.artifacts.pairs import ImagePairs, PairCoordinates, PairMatches
 from snakesfm.errors import ImageError
 from snakesfm.features.keypoints import KeypointSet
-from snakesfm.front_ends import DETECTOR_FREE
+from snakesfm.front_ends import DETECTOR_FREE, LEAST_SIDE_PX
 from snakesfm.learned.batches import cut
 from snakesfm.matching.detector_free import (
     DetectorFreeMatcher,
@@ -214,7 +214,7 @@ class ImageFiles:
         from snakesfm.ingest.read import read_image
 
         name, size = self._names[image], self._sizes[image]
-        shorter = math.ceil(self._side_px * min(size) / max(size))
+        shorter = max(math.ceil(self._side_px * min(size) / max(size)), LEAST_SIDE_PX)
         try:
             pixels = read_image(self._folder / name, shorter)
         except ImageError as error:

@@ -8,10 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from snakesfm.artifacts.features import GlobalDescriptors, LocalFeatures
+from snakesfm.artifacts.hloc import open_hloc, read_hloc_pairs
 from snakesfm.artifacts.images import ImageIndex
 from snakesfm.artifacts.pairs import ImagePairs
 from snakesfm.errors import ConfigError
 from snakesfm.geometry.earth import local_metres, local_origin
+from snakesfm.pair_lists import is_matches_file
 from snakesfm.retrieval.listed import listed_pairs
 from snakesfm.retrieval.pairs import (
     PairTable,
@@ -105,7 +107,9 @@ def read_previews(paths: list[Path], images: int, count: int) -> list[Array]:
 def _choose(job: StageJob, index: ImageIndex, options: "SelectPairsOptions", pairs_file: str) -> PairTable:
     names = [str(name) for name in index.names]
     if options.method == "listed":
-        return _read_list(pairs_file, names, [str(name) for name in index.refused_names])
+        refused = [str(name) for name in index.refused_names]
+        matched = is_matches_file(pairs_file)
+        return _matched_pairs(pairs_file, names) if matched else _read_list(pairs_file, names, refused)
     if options.method == "exhaustive":
         return exhaustive_pairs(len(names))
     table = PairTable.of(np.zeros((0, 2)), "sequential")
@@ -149,6 +153,20 @@ def _read_list(path: str, names: list[str], refused: list[str]) -> PairTable:
     if skipped:
         print(f"warning: {skipped} listed pairs name an image that cannot be used; they are left out")
     return table
+
+
+def _matched_pairs(path: str, names: list[str]) -> PairTable:
+    """The pairs of images that hloc's file of matches holds."""
+    with open_hloc(Path(path).expanduser()) as file:
+        pairs, others = read_hloc_pairs(file, names)
+    if not len(pairs):
+        raise ConfigError(
+            f"'{path}' has no matches of two images of this scene ({others} pairs of others): its names "
+            "must be those of the images, relative to the image folder."
+        )
+    if others:
+        print(f"warning: {others} pairs of '{path}' are left out: they name an image that is not in use")
+    return PairTable.of(pairs, "listed")
 
 
 def _retrieve(paths: list[Path], options: "SelectPairsOptions", threads: int) -> PairTable:

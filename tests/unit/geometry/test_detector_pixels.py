@@ -34,6 +34,12 @@ def test_how_many_pixels_a_detector_pixel_is_wide(settings: dict[str, int], expe
     assert len(detector_scales(np.zeros((0, 2)), settings)) == 0
 
 
+def test_long_images_are_scaled_down_no_further_than_a_matcher_sees_something() -> None:
+    sizes = np.array([[16_000, 1000], [1000, 16_000], [4000, 3000], [2000, 40]])
+    scales = detector_scales(sizes, {"detector_longer_side_px": 840})
+    np.testing.assert_allclose(scales, [1000 / 64, 1000 / 64, 4000 / 840, 1.0], rtol=1e-15)
+
+
 def test_reduced_cameras_project_to_reduced_pixels() -> None:
     rng = np.random.default_rng(0)
     points = np.column_stack([rng.uniform(-0.3, 0.3, (50, 2)), np.ones(50)])

@@ -117,6 +117,15 @@ def test_listed_names_may_hold_spaces():
     assert skipped == 0
 
 
+@pytest.mark.parametrize("space", ["\u00a0", "\u2003", "\u3000", "\v", " \u00a0 "])
+def test_listed_names_may_be_parted_by_any_space(space):
+    names = ["a.jpg", "b\u00a0c.jpg"]
+    table, _ = listed_pairs([f"a.jpg{space}b\u00a0c.jpg"], names, [], "pairs.txt")
+    assert table.pairs.tolist() == [[0, 1]]
+    with pytest.raises(ConfigError, match=r"pairs\.txt:1: there is no image 'd\.jpg'"):
+        listed_pairs([f"a.jpg{space}d.jpg"], names, [], "pairs.txt")
+
+
 def test_listed_pairs_with_a_refused_image_are_skipped():
     table, skipped = listed_pairs(["a bad", "a b"], ["a", "b"], ["bad"], "pairs.txt")
     assert table.pairs.tolist() == [[0, 1]] and skipped == 1

@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import cv2
+import h5py
 import numpy as np
 import pytest
 
@@ -292,6 +293,26 @@ def test_a_list_is_followed(dealt, tmp_path):
         dealt.select(SelectPairsOptions(method="listed"))
     with pytest.raises(ConfigError, match="cannot be read"):
         dealt.select(SelectPairsOptions(method="listed"), str(tmp_path / "missing.txt"))
+
+
+def test_the_pairs_of_a_file_of_matches_are_followed(dealt, tmp_path, capsys):
+    path = tmp_path / "matches.h5"
+    with h5py.File(path, "w") as file:
+        for pair in ("b-ü 2.png/a-1 #{x}.png", "a-1 #{x}.png/b-ü 2.png", "flat.png_gone.png", "bad.jpg/x"):
+            file[f"{pair}/matches0"] = np.array([-1])
+    rows = dealt.select(SelectPairsOptions(exhaustive_up_to=2), str(path))
+    assert [(pair, reason) for pair, reason, *_ in rows] == [((0, 1), "listed"), ((2, 3), "listed")]
+    lines = capsys.readouterr().out.splitlines()
+    assert [line for line in lines if line.startswith("warning: 1 pairs of") and "matches.h5" in line]
+    with h5py.File(path, "w") as file:
+        file["images/a/1.png/matches0"] = np.array([-1])
+    with pytest.raises(
+        ConfigError, match=r"matches\.h5' has no matches of two images of this scene \(1 pairs"
+    ):
+        dealt.select(SelectPairsOptions(), str(path))
+    path.write_bytes(b"no HDF5 file")
+    with pytest.raises(ConfigError, match="no HDF5 file"):
+        dealt.select(SelectPairsOptions(), str(path))
 
 
 def test_neighbours_by_gps_are_those_on_the_ground(tmp_path, capsys):

@@ -1,18 +1,40 @@
 """Stages merge_keypoints and index_matches on places that were matched without keypoints."""
 
+import cv2
 import numpy as np
 import pytest
 
 from snakesfm.artifacts import Header, ImageIndex, LocalFeatures, PairMatches
 from snakesfm.artifacts.pairs import PairCoordinates
 from snakesfm.config.index_matches import IndexMatchesOptions
+from snakesfm.config.match_pairs import MatchPairsOptions
 from snakesfm.config.merge_keypoints import MergeKeypointsOptions
 from snakesfm.geometry.camera import PARAM_SLOTS
-from snakesfm.stages import index_matches, merge_keypoints
+from snakesfm.stages import index_matches, match_pairs, merge_keypoints
 from snakesfm.stages.job import StageJob
 
 HEADER = Header("test", 1, "scene")
 SPREAD_PX = 1.0
+
+
+def write_index(folder, sizes):
+    """An index of images 0.jpg, 1.jpg and so on, of these sizes."""
+    count = len(sizes)
+    columns = {"orientations": 1, "duplicate_of": -1, "blocks": 0, "camera_ids": 0}
+    ImageIndex(
+        names=[f"{k}.jpg" for k in range(count)],
+        sizes=np.array(sizes),
+        sha256=[""] * count,
+        focal_exif_px=np.full(count, np.nan),
+        gps=np.full((count, 3), np.nan),
+        camera_models=[],
+        camera_sizes=np.zeros((0, 2), int),
+        camera_params=np.zeros((0, PARAM_SLOTS)),
+        camera_sources=[],
+        refused_names=[],
+        refused_reasons=[],
+        **{name: np.full(count, value) for name, value in columns.items()},
+    ).write(folder / "index.h5", HEADER)
 
 
 @pytest.fixture
@@ -27,21 +49,7 @@ def run(tmp_path):
         points = np.stack(np.meshgrid(np.arange(8), np.arange(5)), axis=-1).reshape(-1, 2) * 80.0 + 40.0
         pairs = np.array([[0, 1], [0, 2], [1, 2]])
         places = points[None, :, None] + rng.uniform(-SPREAD_PX, SPREAD_PX, (3, 40, 2, 2))
-        columns = {"orientations": 1, "duplicate_of": -1, "blocks": 0, "camera_ids": 0}
-        ImageIndex(
-            names=[f"{k}.jpg" for k in range(3)],
-            sizes=np.tile([640 * enlarged, 480 * enlarged], (3, 1)),
-            sha256=[""] * 3,
-            focal_exif_px=np.full(3, np.nan),
-            gps=np.full((3, 3), np.nan),
-            camera_models=[],
-            camera_sizes=np.zeros((0, 2), int),
-            camera_params=np.zeros((0, PARAM_SLOTS)),
-            camera_sources=[],
-            refused_names=[],
-            refused_reasons=[],
-            **{name: np.full(3, value) for name, value in columns.items()},
-        ).write(folder / "index.h5", HEADER)
+        write_index(folder, [(640 * enlarged, 480 * enlarged)] * 3)
         PairCoordinates(
             pairs=pairs,
             digests=["a", "b", "c"],
@@ -66,6 +74,23 @@ def test_places_of_a_point_become_one_keypoint(run):
     features, matches = run(1)
     assert np.diff(features.offsets).tolist() == [40, 40, 40]
     assert np.diff(matches.offsets).tolist() == [40, 40, 40]
+
+
+@pytest.mark.parametrize(
+    ("size", "side", "least"), [((8000, 500), 840, 64), ((900, 440), 64, 64), ((1024, 768), 500, 375)]
+)
+def test_a_matcher_gets_images_large_enough(tmp_path, size, side, least):
+    width, height = size
+    pixels = np.random.default_rng(0).integers(0, 255, (height, width), dtype=np.uint8)
+    cv2.imwrite(str(tmp_path / "0.jpg"), pixels)
+    write_index(tmp_path, [size])
+    options = MatchPairsOptions(method="loftr", longer_side_px=side)
+    inputs, settings = {"index": tmp_path / "index.h5"}, {"images": str(tmp_path)}
+    job = StageJob("match_pairs", "scene", inputs, (tmp_path / "m.h5",), options, settings)
+    found = match_pairs.ImageFiles(job).read(0)
+    # decoded at the smallest fraction that is not too small
+    assert least <= min(found.gray.shape) < 2.1 * least
+    assert min(found.size) == pytest.approx(height, abs=8)
 
 
 def test_places_in_larger_photographs_are_merged_as_far_as_the_matcher_saw_them(run):
