@@ -7,7 +7,12 @@ from snakesfm.geometry.rotations import angle_between
 from snakesfm.synthetic.problems import make_problem, perturb_rotations
 from snakesfm.translation_averaging.angular import refine_angles, solve_blocks
 from snakesfm.translation_averaging.average import average_translations, normalize_gauge
-from snakesfm.translation_averaging.averagers import ScaleChain, edge_angles_rad, with_rays
+from snakesfm.translation_averaging.averagers import (
+    GlobalPositioning,
+    ScaleChain,
+    edge_angles_rad,
+    with_rays,
+)
 from snakesfm.translation_averaging.landmarks import cover_cameras, intersect
 from snakesfm.translation_averaging.problem import PositioningProblem, edge_directions, world_rays
 from snakesfm.translation_averaging.recovery import mfas_weights
@@ -344,3 +349,15 @@ def test_conjugate_gradients_solve_as_the_factor_does_and_hand_over_where_they_f
     right = rng.normal(size=(700, 3))
     solved = solve_blocks(stiff, right, direct_up_to=0)
     assert np.linalg.norm(stiff @ solved.ravel() - right.ravel()) < 1e-3 * np.linalg.norm(right)
+
+
+@pytest.mark.parametrize(("averager", "tolerance"), [(ScaleChain(), 0.0), (GlobalPositioning(), 1e-6)])
+def test_numbers_of_tracks_cost_nothing_and_change_nothing(averager, tolerance):
+    problem = positioning(make_problem(12, 500, "area", seed=3))
+    # an array of one number per track up to the highest would take terabytes
+    high = dataclasses.replace(problem, ray_tracks=problem.ray_tracks * 10**9 + 10**12)
+    few, many = (average_translations(one, averager, LIMITS) for one in (problem, high))
+    np.testing.assert_allclose(many.centers, few.centers, rtol=0.0, atol=tolerance)
+    np.testing.assert_allclose(many.ray_residuals_rad, few.ray_residuals_rad, rtol=0.0, atol=tolerance)
+    np.testing.assert_array_equal(many.ray_tracks, few.ray_tracks * 10**9 + 10**12)
+    assert np.isfinite(few.centers).all() and len(few.ray_tracks) > 500
