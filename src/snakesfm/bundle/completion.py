@@ -12,6 +12,9 @@ from snakesfm.bundle.reading import observations_of
 
 Array = NDArray[Any]
 
+# pycolmap takes no angle of zero
+SMALLEST_ANGLE_DEG = 1e-9
+
 
 def correspondence_graph(
     keypoint_counts: Mapping[int, int], pairs: Array, offsets: Array, matches: Array
@@ -78,7 +81,7 @@ class TrackCompleter:
         self.options = pycolmap.IncrementalTriangulatorOptions()
         self.options.complete_max_reproj_error = max_error_px
         self.options.merge_max_reproj_error = max_error_px
-        self.options.min_angle = min_angle_deg
+        self.options.min_angle = max(min_angle_deg, SMALLEST_ANGLE_DEG)
         self.options.ignore_two_view_tracks = True
         self.options.random_seed = seed
 
