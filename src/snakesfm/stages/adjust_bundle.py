@@ -75,8 +75,16 @@ def run(job: StageJob) -> None:
     adjusted: list[tuple[BundleModel, np.ndarray]] = []
     records: list[RoundRecord] = []
     for component in range(int(averaged.components.max(initial=0)) + 1):
-        part = restrict_to(replace(poses, cameras=cameras), (averaged.components == component) & ~taken)
-        if part.registered.sum() < (SMALLEST_FURTHER_MODEL if component else 2):
+        mine = (averaged.components == component) & ~taken
+        part = restrict_to(replace(poses, cameras=cameras), mine)
+        posed, least = int(part.registered.sum()), SMALLEST_FURTHER_MODEL if component else 2
+        if posed < least:
+            if mine.any():
+                print(
+                    f"part {component + 1} is left out: {posed} of its {mine.sum()} images have a pose, "
+                    f"and a model takes {least}",
+                    flush=True,
+                )
             continue
         prefix = f"part {component + 1}, " if component else ""
         result, observed, rounds = _adjust(job, index, part, graph, refused, taken, prefix)

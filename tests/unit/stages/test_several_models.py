@@ -102,13 +102,15 @@ def test_each_part_becomes_a_model_the_largest_first(made, scene):
     assert "part 2, round 3" in model.round_names.tolist() and "round 3" in model.round_names.tolist()
 
 
-def test_a_part_without_centres_is_no_model(scene, tmp_path):
+def test_a_part_without_centres_is_no_model(scene, tmp_path, capsys):
     centers = CameraCenters.read(scene["centers"])
     columns = dict(vars(centers)) | {"centers": np.where(PART[:, None], np.nan, centers.centers)}
     CameraCenters(**columns).write(tmp_path / "centers.h5", HEADER)
     inputs = scene | {"centers": tmp_path / "centers.h5"}
     options = AdjustBundleOptions(refine_keypoints=False)
     run(adjust_bundle, options, inputs, tmp_path / "model.h5", intrinsics="fixed", images="")
+    told = [line for line in capsys.readouterr().out.splitlines() if "left out" in line]
+    assert told == [f"part 1 is left out: 0 of its {LARGE} images have a pose, and a model takes 2"]
     model = Reconstruction.read(tmp_path / "model.h5")
     np.testing.assert_array_equal(model.models, np.where(PART, -1, 0))
     assert len(model.points) > 100
