@@ -10,7 +10,9 @@ from snakesfm.translation_averaging.average import average_translations, normali
 from snakesfm.translation_averaging.averagers import (
     GlobalPositioning,
     ScaleChain,
+    TranslationRecovery,
     edge_angles_rad,
+    share_at_one_scale,
     with_rays,
 )
 from snakesfm.translation_averaging.landmarks import cover_cameras, intersect
@@ -361,3 +363,37 @@ def test_numbers_of_tracks_cost_nothing_and_change_nothing(averager, tolerance):
     np.testing.assert_allclose(many.ray_residuals_rad, few.ray_residuals_rad, rtol=0.0, atol=tolerance)
     np.testing.assert_array_equal(many.ray_tracks, few.ray_tracks * 10**9 + 10**12)
     assert np.isfinite(few.centers).all() and len(few.ray_tracks) > 500
+
+
+def test_cameras_at_one_scale_are_those_whose_baselines_agree():
+    count = 20
+    line = np.stack([np.arange(count), np.zeros(count), np.zeros(count)], axis=1).astype(float)
+    pairs = np.concatenate([np.stack([np.arange(count - k), np.arange(k, count)], axis=1) for k in (1, 2)])
+    assert share_at_one_scale(pairs, 7.0 * line + 3.0, line) == 1.0
+    apart = line.copy()
+    apart[12:] += 1000.0
+    assert share_at_one_scale(pairs, apart, line) == 0.6
+    shrunk = line.copy()
+    shrunk[12:] = line[12] + (line[12:] - line[12]) / 1000.0
+    # the first two of the shrunken ones still are about as far from those before as they were
+    assert share_at_one_scale(pairs, shrunk, line) == 0.7
+    assert share_at_one_scale(pairs, np.where(np.arange(count)[:, None] < 12, apart, np.nan), line) == 1.0
+    assert share_at_one_scale(pairs[:0], line, line) == 1.0
+
+
+@pytest.mark.parametrize("reject_outliers", ["none", "mfas"])
+def test_recovery_in_parts_at_scales_of_their_own_gives_way_to_the_chain(reject_outliers, capsys):
+    truth = make_problem(40, 1600, "street", 1.0, 0.3, 1.0, 0.3, seed=5)
+    problem = positioning(truth, perturb_rotations(truth.rotations, 0.2, 3))
+    averager = TranslationRecovery(reject_outliers=reject_outliers)
+    found = averager.position(problem, 0)
+    np.testing.assert_array_equal(found, ScaleChain().position(problem, 0))
+    assert "scale_chain positions them instead" in capsys.readouterr().out
+    assert np.median(errors(found, truth.centers)) < 0.01 * np.ptp(truth.centers, axis=0).max()
+
+
+def test_recovery_at_one_scale_is_kept(capsys):
+    problem = positioning(make_problem(20, 800, "area", 0.5, 0.1, 0.3, 0.1, seed=2))
+    found = TranslationRecovery(reject_outliers="none").position(problem, 0)
+    assert np.isfinite(found).all() and not np.array_equal(found, ScaleChain().position(problem, 0))
+    assert capsys.readouterr().out == ""
