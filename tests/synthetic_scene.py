@@ -84,7 +84,7 @@ def true_model(made):
 
 def graph_of(made, matches=None):
     """The matches, or others of the same pairs, for completion and registration."""
-    counts = [len(points) for points in made.keypoints]
+    counts = {row: len(points) for row, points in enumerate(made.keypoints)}
     matches = made.matches if matches is None else matches
     return correspondence_graph(counts, made.pairs, made.match_offsets, matches)
 

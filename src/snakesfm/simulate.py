@@ -5,11 +5,9 @@ model), config.yaml, results/SCENE/ with the artifacts of the first stages, and 
 that every keypoint shows. ``snakemake --configfile FOLDER/config.yaml`` goes on from there.
 """
 
-import argparse
 import hashlib
 import sys
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +27,7 @@ from snakesfm.geometry.poses import translation_of
 from snakesfm.seeding import derive_seed
 from snakesfm.synthetic.pairing import candidate_pairs, choose_partners, simulate_edge
 from snakesfm.synthetic.sightings import DetectorModel, DistinctLooks, match_looks, sight
+from snakesfm.synthetic.simulation_options import UNTIL, SimulationOptions, parse_arguments
 from snakesfm.synthetic.surveys import SURVEYS, Survey
 
 Array = NDArray[Any]
@@ -36,35 +35,7 @@ Array = NDArray[Any]
 # per image the landmark ids of its keypoints, and those keypoints that can be matched
 Truths = dict[int, tuple[Array, DistinctLooks]]
 
-UNTIL = ("extract_features", "select_pairs", "match_pairs", "estimate_two_view")
-LEAST_IMAGES = {"aerial": 2, "street": 320}
 RECALL = 0.65
-
-
-@dataclass(frozen=True)
-class SimulationOptions:
-    """What is simulated.
-
-    Parameters
-    ----------
-    images : number N of images.
-    survey : ``aerial`` or ``street``, see :mod:`snakesfm.synthetic.surveys`.
-    until : the last stage whose artifacts are made; descriptors are left out from ``match_pairs`` on.
-    partners : how many images that see the same an image chooses; about 1.6 times as many result.
-    keypoints : most keypoints of an image, the strongest.
-    known_focal : whether the cameras' intrinsics are given.
-    blocks : number of blocks, 0 for what the workflow would choose.
-    seed : of everything random.
-    """
-
-    images: int = 1000
-    survey: str = "aerial"
-    until: str = "select_pairs"
-    partners: int = 15
-    keypoints: int = 5000
-    known_focal: bool = True
-    blocks: int = 0
-    seed: int = 0
 
 
 class Simulation:
@@ -72,13 +43,10 @@ class Simulation:
 
     Raises
     ------
-    ConfigError : the folder is not empty, or the survey needs more images.
+    ConfigError : the folder is not empty.
     """
 
     def __init__(self, folder: Path, options: SimulationOptions) -> None:
-        least = LEAST_IMAGES[options.survey]
-        if options.images < least:
-            raise ConfigError(f"A survey '{options.survey}' takes at least {least} images: ask for more.")
         if folder.exists() and any(folder.iterdir()):
             raise ConfigError(f"{folder} is not empty: name a new folder.")
         self.folder = folder.resolve()
@@ -364,45 +332,13 @@ def _join(parts: list[Array], shape: tuple[int, ...], dtype: str) -> Array:
 
 def main(arguments: list[str] | None = None) -> int:
     """Command line: 0 where the scene is there, 1 with one sentence where it cannot be made."""
-    default = SimulationOptions()
-    parser = argparse.ArgumentParser(
-        prog="python -m snakesfm.simulate",
-        description="Make the artifacts of a large scene of known truth.",
-    )
-    parser.add_argument("folder", type=Path, help="a new folder")
-    parser.add_argument("--images", type=int, default=default.images)
-    parser.add_argument("--survey", choices=sorted(SURVEYS), default=default.survey)
-    parser.add_argument("--until", choices=UNTIL, default=default.until, help="the last stage that is made")
-    parser.add_argument(
-        "--partners", type=int, default=default.partners, help="near images that an image chooses"
-    )
-    parser.add_argument("--keypoints", type=int, default=default.keypoints, help="most of an image")
-    parser.add_argument(
-        "--unknown-focal", action="store_true", help="leave the focal length to the workflow"
-    )
-    parser.add_argument(
-        "--blocks", type=int, default=default.blocks, help="0 for what the workflow chooses"
-    )
-    parser.add_argument("--seed", type=int, default=default.seed)
-    given = parser.parse_args(arguments)
-    options = SimulationOptions(
-        given.images,
-        given.survey,
-        given.until,
-        given.partners,
-        given.keypoints,
-        not given.unknown_focal,
-        given.blocks,
-        given.seed,
-    )
     try:
-        Simulation(given.folder, options).run()
+        folder, options = parse_arguments(arguments)
+        Simulation(folder, options).run()
     except SnakesfmError as error:
         sys.stderr.write(f"{error}\n")
         return 1
-    sys.stdout.write(
-        f"{options.images} images simulated; go on with --configfile {given.folder}/config.yaml\n"
-    )
+    sys.stdout.write(f"{options.images} images simulated; go on with --configfile {folder}/config.yaml\n")
     return 0
 
 

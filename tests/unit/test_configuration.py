@@ -47,6 +47,13 @@ from snakesfm.errors import ConfigError
             {"adjust_bundle": {"refine_finenesses": [2.0, 1.0]}},
             ["key 'adjust_bundle': refine_finenesses must ascend"],
         ),
+        ({"adjust_bundle": {"thresholds_px": [5, 0]}}, ["thresholds_px' = 0: ", "greater than 0."]),
+        ({"adjust_bundle": {"early_loss_share": 0}}, ["early_loss_share' = 0: ", "greater than 0."]),
+        ({"evaluate_model": {"relative_thresholds_deg": [0, 1]}}, ["_deg' = 0: ", "greater than 0."]),
+        ({"evaluate_model": {"global_thresholds_deg": [1, 181]}}, ["_deg' = 181: ", "equal to 180."]),
+        ({"adjust_bundle": {"max_iterations": 2**31}}, ["max_iterations' = 2147483648: ", "1000000"]),
+        ({"average_translations": {"edge_weight": float("inf")}}, ["edge_weight' = inf: ", "1000000"]),
+        ({"average_rotations": {"min_component_images": 2}}, ["_images' = 2: ", "equal to 3."]),
     ],
 )
 def test_a_wrong_key_or_value_gives_one_sentence_that_names_it(values: dict, parts: list[str]) -> None:

@@ -13,7 +13,9 @@ from snakesfm.artifacts.pairs import REJECTIONS, TwoViewGeometries
 Array = NDArray[Any]
 
 
-def gather_image_columns(paths: Sequence[Path], count: int, *columns: str) -> list[list[Array]]:
+def gather_image_columns(
+    paths: Sequence[Path], count: int, *columns: str, images: Collection[int] | None = None
+) -> list[list[Array]]:
     """Columns of local features per image of the scene, without reading the others.
 
     Parameters
@@ -21,21 +23,21 @@ def gather_image_columns(paths: Sequence[Path], count: int, *columns: str) -> li
     paths : the LocalFeatures files of all blocks.
     count : images of the index.
     columns : names of per-keypoint columns, such as ``keypoints``.
+    images : rows of the images that are wanted; all if None.
 
     Returns
     -------
-    Per column a list over the images; empty arrays for images without features.
+    Per column a list over the images; empty arrays for images without features or not wanted.
     """
     gathered: list[list[Array]] = [[np.zeros((0, 0))] * count for _ in columns]
     for path in paths:
         with LocalFeatures.open(path) as file:
             ids, offsets = file["image_ids"][()], file["offsets"][()]
+            wanted = [row for row, image in enumerate(ids.tolist()) if images is None or image in images]
             for values, name in zip(gathered, columns, strict=True):
-                column = file[name][()]
-                if len(ids) == 0:
-                    continue
-                for row, image in enumerate(ids):
-                    values[image] = column[offsets[row] : offsets[row + 1]]
+                column = file[name] if len(wanted) < len(ids) else file[name][()]
+                for row in wanted:
+                    values[ids[row]] = column[offsets[row] : offsets[row + 1]]
     for values in gathered:
         shape, dtype = next(((v.shape[1:], v.dtype) for v in values if v.size), ((2,), np.dtype("f4")))
         values[:] = [v if v.size else np.zeros((0, *shape), dtype) for v in values]
@@ -80,16 +82,20 @@ def gather_inlier_matches(paths: Sequence[Path], pairs: Array) -> tuple[Array, A
     parts: list[tuple[tuple[int, int], Array]] = []
     for path in paths:
         with TwoViewGeometries.open(path) as file:
-            tile, offsets, inliers = file["pairs"][()], file["offsets"][()], file["inliers"][()]
-        for row in np.nonzero(np.diff(offsets))[0]:
-            pair = (int(tile[row, 0]), int(tile[row, 1]))
-            if pair in wanted:
-                parts.append((pair, inliers[offsets[row] : offsets[row + 1]]))
+            tile, offsets = file["pairs"][()].tolist(), file["offsets"][()]
+            rows = [row for row in np.nonzero(np.diff(offsets))[0].tolist() if tuple(tile[row]) in wanted]
+            if not rows:
+                continue
+            first = offsets[rows[0]]
+            inliers = file["inliers"][first : offsets[rows[-1] + 1]]
+        for row in rows:
+            i, j = tile[row]
+            parts.append(((i, j), inliers[offsets[row] - first : offsets[row + 1] - first]))
     parts.sort(key=lambda part: part[0])
-    rows = np.array([pair for pair, _ in parts], dtype=np.int32).reshape(-1, 2)
+    found = np.array([pair for pair, _ in parts], dtype=np.int32).reshape(-1, 2)
     starts = np.r_[0, np.cumsum([len(matches) for _, matches in parts])].astype(np.int64)
     matches = np.concatenate([matches for _, matches in parts] or [np.zeros((0, 2), dtype=np.int32)])
-    return rows, starts, matches
+    return found, starts, matches
 
 
 def gather_refused_pairs(paths: Sequence[Path]) -> Array:

@@ -1,6 +1,6 @@
 """More observations for the model: tracks completed and merged, points made of left-out matches."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import cv2  # noqa: F401 - must be loaded before pycolmap, whose PNG library clashes otherwise
@@ -12,21 +12,24 @@ from snakesfm.bundle.reading import observations_of
 
 Array = NDArray[Any]
 
+# pycolmap takes no angle of zero
+SMALLEST_ANGLE_DEG = 1e-9
+
 
 def correspondence_graph(
-    keypoint_counts: Sequence[int], pairs: Array, offsets: Array, matches: Array
+    keypoint_counts: Mapping[int, int], pairs: Array, offsets: Array, matches: Array
 ) -> pycolmap.CorrespondenceGraph:
     """The inlier matches for pycolmap's triangulator.
 
     Parameters
     ----------
-    keypoint_counts : of each image.
+    keypoint_counts : by image, of those that take part.
     pairs : (P,2) int, images i < j.
     offsets : (P+1,) int64, rows ``offsets[k]:offsets[k+1]`` of ``matches`` belong to pair k.
     matches : (M,2) int, keypoint rows in image i and in image j.
     """
     graph = pycolmap.CorrespondenceGraph()
-    for row, count in enumerate(keypoint_counts):
+    for row, count in keypoint_counts.items():
         graph.add_image(row + 1, count)
     for row, (i, j) in enumerate(pairs.tolist()):
         found = matches[offsets[row] : offsets[row + 1]]
@@ -78,7 +81,7 @@ class TrackCompleter:
         self.options = pycolmap.IncrementalTriangulatorOptions()
         self.options.complete_max_reproj_error = max_error_px
         self.options.merge_max_reproj_error = max_error_px
-        self.options.min_angle = min_angle_deg
+        self.options.min_angle = max(min_angle_deg, SMALLEST_ANGLE_DEG)
         self.options.ignore_two_view_tracks = True
         self.options.random_seed = seed
 

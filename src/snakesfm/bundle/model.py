@@ -52,7 +52,7 @@ class BundleModel:
 
 
 def to_reconstruction(
-    model: BundleModel, keypoints: Sequence[Array], names: Sequence[str]
+    model: BundleModel, keypoints: Sequence[Array], names: Sequence[str], images: Array | None = None
 ) -> pycolmap.Reconstruction:
     """The model for pycolmap.
 
@@ -61,14 +61,15 @@ def to_reconstruction(
     model : observations by images that are not registered are left out.
     keypoints : per image (K_i,2), pixels.
     names : of the images.
+    images : (N,) bool, those that take part, registered or not; all if None.
     """
     reconstruction = pycolmap.Reconstruction()
     for row, camera in enumerate(model.cameras):
         reconstruction.add_camera_with_trivial_rig(camera.to_pycolmap(row + 1))
     posed = model.registered
-    for row, name in enumerate(names):
+    for row in range(len(names)) if images is None else np.flatnonzero(images).tolist():
         image = pycolmap.Image(
-            name=str(name),
+            name=str(names[row]),
             camera_id=int(model.camera_ids[row]) + 1,
             image_id=row + 1,
             keypoints=keypoints[row].astype(np.float64),

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from snakesfm.bundle.model import BundleModel
 from snakesfm.geometry.camera import Camera
+from snakesfm.view_graph.components import label_components
 
 Array = NDArray[Any]
 
@@ -29,6 +30,12 @@ def restrict_to(model: BundleModel, images: Array) -> BundleModel:
         image_ids=model.image_ids[kept],
         keypoint_ids=model.keypoint_ids[kept],
     )
+
+
+def tied_images(pairs: Array, posed: Array) -> Array:
+    """Which images (N,) bool have a pose or are tied to posed ones by chains of pairs (P,2)."""
+    labels = label_components(len(posed), pairs)
+    return np.isin(labels, labels[posed])
 
 
 def join_models(models: Sequence[BundleModel], cameras: tuple[Camera, ...]) -> tuple[BundleModel, Array]:

@@ -50,12 +50,13 @@ def register_left_out(
     observed = _ObservedKeypoints.of(reconstruction)
     if not len(observed.keys):
         return []
+    registered = set(reconstruction.reg_image_ids())
     matched: dict[int, list[int]] = {image: [] for image in left_out}
     for pair in graph.image_pairs():
         first, second = pycolmap.pair_id_to_image_pair(pair)
-        if first in matched:
+        if first in matched and second in registered:
             matched[first].append(second)
-        if second in matched:
+        if second in matched and first in registered:
             matched[second].append(first)
     found = {image: _matched_points(graph, image, others, observed) for image, others in matched.items()}
     in_use = {reconstruction.image(image_id).camera_id for image_id in reconstruction.reg_image_ids()}

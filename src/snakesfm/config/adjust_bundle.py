@@ -16,7 +16,9 @@ class AdjustBundleOptions(StageOptions):
     solver: Literal["ceres", "gtsam"] = "ceres"
     """Least-squares solver: Ceres through pycolmap, or gtsam (slower, fewer camera models)."""
 
-    thresholds_px: tuple[float, ...] = Field(default=(10.0, 5.0, 3.0), min_length=1, max_length=10)
+    thresholds_px: tuple[Annotated[float, Field(gt=0.0)], ...] = Field(
+        default=(10.0, 5.0, 3.0), min_length=1, max_length=10
+    )
     """Largest reprojection error of an observation after each of the chained rounds."""
 
     loss: Literal["huber", "cauchy", "squared"] = "cauchy"
@@ -28,7 +30,7 @@ class AdjustBundleOptions(StageOptions):
     loss_scale_sigmas: float = Field(default=3.5, gt=0.0, le=100.0)
     """What 'auto' takes: so many standard deviations of the keypoints' noise; 2.4 without refinement."""
 
-    early_loss_share: float = Field(default=0.4, ge=0.0, le=10.0)
+    early_loss_share: float = Field(default=0.4, gt=0.0, le=10.0)
     """The same of earlier rounds, as a share of the round's threshold: a bad start needs a wide loss."""
 
     outlier_sigmas: float = Field(default=12.0, ge=3.0, le=1000.0)
@@ -126,7 +128,7 @@ class AdjustBundleOptions(StageOptions):
     final_observations: int = Field(default=0, ge=0)
     """The same in the last round and later ones; 0 for all."""
 
-    max_iterations: Literal["auto"] | Annotated[int, Field(ge=1)] = "auto"
+    max_iterations: Annotated[int, Field(ge=1, le=1_000_000)] | Literal["auto"] = "auto"
     """Iterations of the solver per pass; 'auto' is 50, up to 500 where a small model makes them cheap."""
 
     function_tolerance: float = Field(default=3e-6, gt=0.0)

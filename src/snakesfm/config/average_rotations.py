@@ -24,5 +24,5 @@ class AverageRotationsOptions(StageOptions):
     passes: int = Field(default=2, ge=1, le=5)
     """How often the rotations are averaged; then edges are refused or taken back by residuals."""
 
-    min_component_images: int = Field(default=5, ge=2)
-    """Images that a part of the view graph needs to become a model of its own beside the largest part."""
+    min_component_images: int = Field(default=5, ge=3)
+    """Images, three or more, that a part of the graph needs to be a model of its own beside the largest."""

@@ -27,7 +27,7 @@ class AverageTranslationsOptions(StageOptions):
     ray_sigma_deg: float = Field(default=0.3, gt=0, le=10)
     """Expected error of a ray, mostly that of its camera's averaged rotation."""
 
-    edge_weight: float = Field(default=0.1, ge=0)
+    edge_weight: float = Field(default=0.1, ge=0, le=1e6)
     """Weight of a two-view direction against that of a ray when the angles are refined."""
 
     reject_outliers: Literal["mfas", "residual", "none"] = "residual"

@@ -24,7 +24,7 @@ from snakesfm.bundle.model import (
     reprojection_errors,
     to_reconstruction,
 )
-from snakesfm.bundle.models import join_models, restrict_to
+from snakesfm.bundle.models import join_models, restrict_to, tied_images
 from snakesfm.bundle.reading import observed_keypoints
 from snakesfm.bundle.round_settings import RoundRecord, RoundSettings
 from snakesfm.bundle.rounds import adjust_rounds
@@ -75,8 +75,16 @@ def run(job: StageJob) -> None:
     adjusted: list[tuple[BundleModel, np.ndarray]] = []
     records: list[RoundRecord] = []
     for component in range(int(averaged.components.max(initial=0)) + 1):
-        part = restrict_to(replace(poses, cameras=cameras), (averaged.components == component) & ~taken)
-        if part.registered.sum() < (SMALLEST_FURTHER_MODEL if component else 2):
+        mine = (averaged.components == component) & ~taken
+        part = restrict_to(replace(poses, cameras=cameras), mine)
+        posed, least = int(part.registered.sum()), SMALLEST_FURTHER_MODEL if component else 2
+        if posed < least:
+            if mine.any():
+                print(
+                    f"part {component + 1} is left out: {posed} of its {mine.sum()} images have a pose, "
+                    f"and a model takes {least}",
+                    flush=True,
+                )
             continue
         prefix = f"part {component + 1}, " if component else ""
         result, observed, rounds = _adjust(job, index, part, graph, refused, taken, prefix)
@@ -120,14 +128,16 @@ def _adjust(
     prefix : goes before the names of the rounds.
     """
     options: AdjustBundleOptions = job.options
-    reconstruction = _start(job, index, poses)
     pairs = np.concatenate(
         [_usable_pairs(view_graph, poses), refused[poses.registered[refused].all(axis=1)]]
     )
     pairs = pairs[~taken[pairs].any(axis=1)]
+    images = tied_images(pairs, poses.registered)
+    pairs = pairs[images[pairs].all(axis=1)]
+    reconstruction = _start(job, index, poses, images)
 
     def read_graph() -> pycolmap.CorrespondenceGraph:
-        counts = [reconstruction.image(row + 1).num_points2D() for row in range(len(index.names))]
+        counts = {image_id - 1: image.num_points2D() for image_id, image in reconstruction.images.items()}
         return correspondence_graph(counts, *gather_inlier_matches(job.paths("geometries"), pairs))
 
     fixed = job.settings.get("intrinsics", "fixed") == "fixed"
@@ -165,10 +175,20 @@ def _adjust(
     return result, observed.astype(np.float32), reported
 
 
-def _start(job: StageJob, index: ImageIndex, poses: BundleModel) -> pycolmap.Reconstruction:
-    """The poses with the triangulated points that they see; it alone stays in memory."""
+def _start(
+    job: StageJob, index: ImageIndex, poses: BundleModel, images: np.ndarray
+) -> pycolmap.Reconstruction:
+    """The poses with the triangulated points that they see, and the ``images`` (N,) bool alone.
+
+    It alone stays in memory.
+    """
     start = TriangulatedPoints.read(job.path("points"))
-    (keypoints,) = gather_image_columns(job.paths("features"), len(index.names), "keypoints")
+    (keypoints,) = gather_image_columns(
+        job.paths("features"),
+        len(index.names),
+        "keypoints",
+        images=set(np.flatnonzero(images).tolist()),
+    )
     reduced = reduce_all_keypoints(keypoints, index.sizes, job.settings)
     model = replace(
         poses,
@@ -177,7 +197,7 @@ def _start(job: StageJob, index: ImageIndex, poses: BundleModel) -> pycolmap.Rec
         image_ids=start.image_ids,
         keypoint_ids=start.keypoint_ids,
     )
-    return to_reconstruction(restrict_to(model, poses.registered), reduced, index.names.tolist())
+    return to_reconstruction(restrict_to(model, poses.registered), reduced, index.names.tolist(), images)
 
 
 def _usable_pairs(graph: ViewGraph, poses: BundleModel) -> np.ndarray:

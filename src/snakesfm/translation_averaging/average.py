@@ -79,7 +79,8 @@ def average_translations(
     centre if that does not hold either: weakly seen cameras are otherwise thrown far away.
     """
     part = largest_part(problem)
-    chosen = with_rays(part, rays_per_camera)
+    # what is worked out per track must cost as much as there are rays, not as the highest number tells
+    chosen, tracks = with_rays(part, rays_per_camera).number_tracks()
     images = part.images()
     if len(images) < 2:
         centers = np.full((problem.image_count, 3), np.nan)
@@ -103,7 +104,7 @@ def average_translations(
     return AveragedCenters(
         centers=centers,
         edge_residuals_rad=edge_angles_rad(problem, centers),
-        ray_tracks=seen.ray_tracks,
+        ray_tracks=tracks[seen.ray_tracks],
         ray_residuals_rad=angles_rad(seen, centers, points),
     )
 

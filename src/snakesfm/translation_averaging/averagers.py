@@ -9,8 +9,12 @@ from numpy.typing import NDArray
 
 from snakesfm.translation_averaging.landmarks import cover_cameras
 from snakesfm.translation_averaging.problem import PositioningProblem
+from snakesfm.view_graph.components import label_components
 
 Array = NDArray[Any]
+
+LARGEST_SCALE_GAP = 10.0
+LEAST_SHARE_AT_ONE_SCALE = 0.9
 
 
 class TranslationAverager(Protocol):
@@ -37,13 +41,16 @@ class ScaleChain:
 
     def position(self, problem: PositioningProblem, seed: int) -> Array:
         """See :class:`TranslationAverager`."""
+        centers = self.link(problem)
+        return TranslationRecovery().position(problem, seed) if centers is None else centers
+
+    def link(self, problem: PositioningProblem) -> Array | None:
+        """Centres (N,3), or None where the landmarks link fewer than half of the cameras."""
         from snakesfm.translation_averaging.scale_chain import chain_centers
 
         rays = with_rays(problem, self.rays_per_camera)
         centers = chain_centers(rays, 1.5 * self.sigma_rad, self.max_relative_sigma)
-        if 2 * np.isfinite(centers[:, 0]).sum() < len(problem.images()):
-            return TranslationRecovery().position(problem, seed)
-        return centers
+        return None if 2 * np.isfinite(centers[:, 0]).sum() < len(problem.images()) else centers
 
 
 @dataclass(frozen=True)
@@ -51,7 +58,8 @@ class TranslationRecovery:
     """gtsam's TranslationRecovery on camera-camera and camera-landmark directions with a Huber loss.
 
     With the outlier rejection of 1DSfM (Wilson and Snavely, ECCV 2014; ``mfas``), or by the residuals of a
-    first solution (``residual``). It starts at random places.
+    first solution (``residual``). It starts at random places. Directions alone may agree with parts of the
+    scene at scales of their own; where landmarks say otherwise, :class:`ScaleChain` is used instead.
     """
 
     rays_per_camera: int = 12
@@ -66,7 +74,7 @@ class TranslationRecovery:
         """See :class:`TranslationAverager`."""
         from snakesfm.translation_averaging.recovery import mfas_weights, recover_translations
 
-        problem = with_rays(problem, self.rays_per_camera)
+        whole, problem = problem, with_rays(problem, self.rays_per_camera)
         if self.reject_outliers == "mfas" and len(problem.pairs):
             keep = mfas_weights(problem, self.mfas_projections, seed) < self.mfas_weight
             problem = problem.select_edges(keep)
@@ -75,7 +83,17 @@ class TranslationRecovery:
             keep = ~(edge_angles_rad(problem, centers) > self.residual_rad)
             if not keep.all():
                 centers = recover_translations(problem.select_edges(keep), self.sigma, self.huber, seed)
-        return centers
+        chained = ScaleChain().link(whole)
+        if chained is None:
+            return centers
+        share = share_at_one_scale(whole.pairs, centers, chained)
+        if share >= LEAST_SHARE_AT_ONE_SCALE:
+            return centers
+        print(
+            f"translation_recovery left the cameras in parts at scales of their own, the largest of "
+            f"{share:.0%}: scale_chain positions them instead"
+        )
+        return chained
 
 
 @dataclass(frozen=True)
@@ -102,6 +120,28 @@ def with_rays(problem: PositioningProblem, rays_per_camera: int) -> PositioningP
     return problem.select_rays(
         cover_cameras(problem.ray_images, problem.ray_tracks, problem.image_count, rays_per_camera)
     )
+
+
+def share_at_one_scale(pairs: Array, centers: Array, others: Array) -> float:
+    """Share of the cameras whose baselines have the same scale to each other in two results.
+
+    That of the largest set that edges tie whose lengths in both differ by the usual factor, give or take
+    ``LARGEST_SCALE_GAP``; of the cameras that have a centre in both.
+
+    Parameters
+    ----------
+    pairs : (E,2) edges.
+    centers, others : (N,3), NaN where there is none.
+    """
+    both = np.isfinite(centers[:, 0]) & np.isfinite(others[:, 0])
+    edges = pairs[both[pairs].all(axis=1)]
+    if not len(edges):
+        return 1.0
+    lengths = [np.linalg.norm(c[edges[:, 1]] - c[edges[:, 0]], axis=1) for c in (centers, others)]
+    gaps = np.subtract(*np.log(np.maximum(lengths, 1e-300)))
+    alike = np.abs(gaps - np.median(gaps)) < math.log(LARGEST_SCALE_GAP)
+    labels = label_components(len(centers), edges[alike])
+    return float(np.bincount(labels[both]).max() / both.sum())
 
 
 def edge_angles_rad(problem: PositioningProblem, centers: Array) -> Array:

@@ -27,9 +27,11 @@ def position_globally(
     rotations = _facing(problem.rays, rows, len(images))
     local = np.einsum("qij,qj->qi", rotations[rows], problem.rays)
     usable = local[:, 2] > 0.01
-    problem, local = problem.select_rays(usable), local[usable]
-    tracks, starts, lengths = np.unique(problem.ray_tracks, return_index=True, return_counts=True)
-    points = np.zeros((int(tracks.max(initial=-1)) + 1, 3))
+    problem, tracks = problem.select_rays(usable).number_tracks()
+    local = local[usable]
+    lengths = np.bincount(problem.ray_tracks, minlength=len(tracks))
+    starts = np.cumsum(lengths) - lengths
+    points = np.zeros((len(tracks), 3))
     if start is not None:
         known = np.isfinite(start[problem.ray_images, 0])
         seen = problem.select_rays(known)
@@ -56,12 +58,12 @@ def position_globally(
         frame = model.image(image + 1).frame
         frame.set_cam_from_world(1, pose)
         model.register_frame(frame.frame_id)
-    for track, first, length in zip(tracks.tolist(), starts.tolist(), lengths.tolist(), strict=True):
+    for point, first, length in zip(points, starts.tolist(), lengths.tolist(), strict=True):
         elements = [
             pycolmap.TrackElement(int(problem.ray_images[q]) + 1, int(keypoint[q]))
             for q in range(first, first + length)
         ]
-        model.add_point3D(points[track], pycolmap.Track(elements))
+        model.add_point3D(point, pycolmap.Track(elements))
 
     options = pycolmap.GlobalPositionerOptions()
     options.use_gpu = False

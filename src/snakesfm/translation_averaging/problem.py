@@ -1,6 +1,6 @@
 """What a translation averager gets and gives."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -55,6 +55,11 @@ class PositioningProblem:
             self.ray_tracks,
             self.rays,
         )
+
+    def number_tracks(self) -> tuple["PositioningProblem", Array]:
+        """The same problem with the tracks that occur numbered from 0, and the former number of each."""
+        tracks, rows = np.unique(self.ray_tracks, return_inverse=True)
+        return replace(self, ray_tracks=rows), tracks
 
     def images(self) -> Array:
         """Ascending ids of the images that occur."""

@@ -160,7 +160,8 @@ def test_wild_cameras_are_reset(params, source, wild):
         assert tuple(reconstruction.camera(1).params) == start.params
 
 
-def test_completion_brings_observations_back():
+@pytest.mark.parametrize("min_angle_deg", [1.0, 0.0])
+def test_completion_brings_observations_back(min_angle_deg):
     made = problem()
     rng = np.random.default_rng(0)
     half = rng.random(len(made.track_image_ids)) < 0.5
@@ -168,7 +169,7 @@ def test_completion_brings_observations_back():
     reconstruction = to_reconstruction(model, made.keypoints, NAMES)
     drop_short_tracks(reconstruction, 2)
     before = reconstruction.compute_num_observations()
-    added = TrackCompleter(reconstruction, graph_of(made), 4.0, 1.0, 0)()
+    added = TrackCompleter(reconstruction, graph_of(made), 4.0, min_angle_deg, 0)()
     result = from_reconstruction(reconstruction, model)
     assert added == len(result.image_ids) - before > 0.3 * len(half)
     assert errors_px(result, made).max() < 6.0

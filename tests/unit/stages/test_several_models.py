@@ -1,6 +1,7 @@
 """A scene of parts that nothing ties together: a model of each, from the averagings to the export."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pycolmap
@@ -8,7 +9,9 @@ import pytest
 from synthetic_scene import HEADER, side_by_side, true_model, write_scene
 
 from snakesfm.artifacts import CameraCenters, CameraRotations, Reconstruction
-from snakesfm.bundle.models import join_models, restrict_to
+from snakesfm.artifacts.gather import gather_image_columns, gather_inlier_matches
+from snakesfm.bundle import rounds
+from snakesfm.bundle.models import join_models, restrict_to, tied_images
 from snakesfm.config.adjust_bundle import AdjustBundleOptions
 from snakesfm.config.average_rotations import AverageRotationsOptions
 from snakesfm.config.average_translations import AverageTranslationsOptions
@@ -99,16 +102,64 @@ def test_each_part_becomes_a_model_the_largest_first(made, scene):
     assert "part 2, round 3" in model.round_names.tolist() and "round 3" in model.round_names.tolist()
 
 
-def test_a_part_without_centres_is_no_model(scene, tmp_path):
+def test_a_part_without_centres_is_no_model(scene, tmp_path, capsys):
     centers = CameraCenters.read(scene["centers"])
     columns = dict(vars(centers)) | {"centers": np.where(PART[:, None], np.nan, centers.centers)}
     CameraCenters(**columns).write(tmp_path / "centers.h5", HEADER)
     inputs = scene | {"centers": tmp_path / "centers.h5"}
     options = AdjustBundleOptions(refine_keypoints=False)
     run(adjust_bundle, options, inputs, tmp_path / "model.h5", intrinsics="fixed", images="")
+    told = [line for line in capsys.readouterr().out.splitlines() if "left out" in line]
+    assert told == [f"part 1 is left out: 0 of its {LARGE} images have a pose, and a model takes 2"]
     model = Reconstruction.read(tmp_path / "model.h5")
     np.testing.assert_array_equal(model.models, np.where(PART, -1, 0))
     assert len(model.points) > 100
+
+
+def test_a_part_is_given_its_own_images_and_those_tied_to_it(made, scene, tmp_path, monkeypatch):
+    left_out = np.array([3, SMALL + 4])
+    averaged = CameraRotations.read(scene["rotations"])
+    components, rotations = averaged.components.copy(), averaged.rotations.copy()
+    components[left_out], rotations[left_out] = -1, np.nan
+    replace(averaged, components=components, rotations=rotations).write(tmp_path / "rotations.h5", HEADER)
+    given = []
+
+    def adjust_rounds(reconstruction, *arguments):
+        registered = np.array(sorted(reconstruction.reg_image_ids())) - 1
+        given.append((np.array(sorted(reconstruction.images)) - 1, registered))
+        return rounds.adjust_rounds(reconstruction, *arguments)
+
+    monkeypatch.setattr(adjust_bundle, "adjust_rounds", adjust_rounds)
+    inputs = scene | {"rotations": tmp_path / "rotations.h5"}
+    options = AdjustBundleOptions(refine_keypoints=False)
+    run(adjust_bundle, options, inputs, tmp_path / "model.h5", intrinsics="fixed", images="")
+    for (images, registered), part in zip(given, (PART, ~PART), strict=True):
+        np.testing.assert_array_equal(images, np.flatnonzero(part))
+        np.testing.assert_array_equal(registered, np.setdiff1d(images, left_out))
+    model = Reconstruction.read(tmp_path / "model.h5")
+    np.testing.assert_array_equal(model.models, np.where(PART, 0, 1))
+    for part in (PART, ~PART):
+        assert rotation_errors_deg(model.rotations[part], made.rotations[part]).max() < 0.5
+
+
+def test_images_are_tied_by_chains_of_pairs():
+    pairs = np.array([[0, 3], [3, 5], [1, 2], [4, 6]])
+    posed = np.isin(np.arange(8), [0, 6])
+    np.testing.assert_array_equal(np.flatnonzero(tied_images(pairs, posed)), [0, 3, 4, 5, 6])
+    np.testing.assert_array_equal(tied_images(pairs[:0], posed), posed)
+
+
+def test_only_what_is_wanted_is_gathered(made, scene):
+    wanted = {0, 3, 4, COUNT - 1}
+    (some,) = gather_image_columns(scene["features"], COUNT, "keypoints", images=wanted)
+    for row, keypoints in enumerate(some):
+        np.testing.assert_array_equal(keypoints, made.keypoints[row][: None if row in wanted else 0])
+    rows = [2, 5, 6, len(made.pairs) - 1]
+    pairs, offsets, matches = gather_inlier_matches(scene["geometries"], made.pairs[rows])
+    np.testing.assert_array_equal(pairs, made.pairs[rows])
+    for k, row in enumerate(rows):
+        expected = made.matches[made.match_offsets[row] : made.match_offsets[row + 1]]
+        np.testing.assert_array_equal(matches[offsets[k] : offsets[k + 1]], expected)
 
 
 def test_models_are_exported_side_by_side_and_the_first_is_evaluated(made, scene, tmp_path):

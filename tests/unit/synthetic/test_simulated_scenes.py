@@ -236,3 +236,28 @@ def test_a_folder_in_use_is_refused(tmp_path: Path, capsys: pytest.CaptureFixtur
     assert "is not empty: name a new folder" in capsys.readouterr().err
     assert main([str(tmp_path / "new"), "--images", "10", "--survey", "street"]) == 1
     assert "at least 320 images" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("option", ["--seed", "--blocks"])
+@pytest.mark.parametrize("value", ["-1", "1.5"])
+def test_numbers_that_are_none_are_refused(
+    option: str, value: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as caught:
+        main([str(tmp_path / "new"), "--images", "10", option, value])
+    assert caught.value.code == 2
+    assert f"{option}: '{value}' is no whole number: give 0 or more" in capsys.readouterr().err
+    assert not (tmp_path / "new").exists()
+
+
+def test_a_focal_length_is_not_unknown_where_relative_poses_are_known(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = ["--images", "10", "--keypoints", "200", "--unknown-focal", "--until"]
+    assert main([str(tmp_path / "new"), *arguments, "estimate_two_view"]) == 1
+    assert "end with --until match_pairs." in capsys.readouterr().err
+    assert not (tmp_path / "new").exists()
+    assert main([str(tmp_path / "new"), *arguments, "match_pairs"]) == 0
+    written = tmp_path / "new" / "results" / "new"
+    assert ImageIndex.read(written / "index_images" / "index.h5").camera_sources.tolist() == ["default"]
+    assert not (written / "calibrate_cameras").exists()

@@ -7,7 +7,14 @@ from snakesfm.geometry.rotations import angle_between
 from snakesfm.synthetic.problems import make_problem, perturb_rotations
 from snakesfm.translation_averaging.angular import refine_angles, solve_blocks
 from snakesfm.translation_averaging.average import average_translations, normalize_gauge
-from snakesfm.translation_averaging.averagers import ScaleChain, edge_angles_rad, with_rays
+from snakesfm.translation_averaging.averagers import (
+    GlobalPositioning,
+    ScaleChain,
+    TranslationRecovery,
+    edge_angles_rad,
+    share_at_one_scale,
+    with_rays,
+)
 from snakesfm.translation_averaging.landmarks import cover_cameras, intersect
 from snakesfm.translation_averaging.problem import PositioningProblem, edge_directions, world_rays
 from snakesfm.translation_averaging.recovery import mfas_weights
@@ -344,3 +351,49 @@ def test_conjugate_gradients_solve_as_the_factor_does_and_hand_over_where_they_f
     right = rng.normal(size=(700, 3))
     solved = solve_blocks(stiff, right, direct_up_to=0)
     assert np.linalg.norm(stiff @ solved.ravel() - right.ravel()) < 1e-3 * np.linalg.norm(right)
+
+
+@pytest.mark.parametrize(("averager", "tolerance"), [(ScaleChain(), 0.0), (GlobalPositioning(), 1e-6)])
+def test_numbers_of_tracks_cost_nothing_and_change_nothing(averager, tolerance):
+    problem = positioning(make_problem(12, 500, "area", seed=3))
+    # an array of one number per track up to the highest would take terabytes
+    high = dataclasses.replace(problem, ray_tracks=problem.ray_tracks * 10**9 + 10**12)
+    few, many = (average_translations(one, averager, LIMITS) for one in (problem, high))
+    np.testing.assert_allclose(many.centers, few.centers, rtol=0.0, atol=tolerance)
+    np.testing.assert_allclose(many.ray_residuals_rad, few.ray_residuals_rad, rtol=0.0, atol=tolerance)
+    np.testing.assert_array_equal(many.ray_tracks, few.ray_tracks * 10**9 + 10**12)
+    assert np.isfinite(few.centers).all() and len(few.ray_tracks) > 500
+
+
+def test_cameras_at_one_scale_are_those_whose_baselines_agree():
+    count = 20
+    line = np.stack([np.arange(count), np.zeros(count), np.zeros(count)], axis=1).astype(float)
+    pairs = np.concatenate([np.stack([np.arange(count - k), np.arange(k, count)], axis=1) for k in (1, 2)])
+    assert share_at_one_scale(pairs, 7.0 * line + 3.0, line) == 1.0
+    apart = line.copy()
+    apart[12:] += 1000.0
+    assert share_at_one_scale(pairs, apart, line) == 0.6
+    shrunk = line.copy()
+    shrunk[12:] = line[12] + (line[12:] - line[12]) / 1000.0
+    # the first two of the shrunken ones still are about as far from those before as they were
+    assert share_at_one_scale(pairs, shrunk, line) == 0.7
+    assert share_at_one_scale(pairs, np.where(np.arange(count)[:, None] < 12, apart, np.nan), line) == 1.0
+    assert share_at_one_scale(pairs[:0], line, line) == 1.0
+
+
+@pytest.mark.parametrize("reject_outliers", ["none", "mfas"])
+def test_recovery_in_parts_at_scales_of_their_own_gives_way_to_the_chain(reject_outliers, capsys):
+    truth = make_problem(40, 1600, "street", 1.0, 0.3, 1.0, 0.3, seed=5)
+    problem = positioning(truth, perturb_rotations(truth.rotations, 0.2, 3))
+    averager = TranslationRecovery(reject_outliers=reject_outliers)
+    found = averager.position(problem, 0)
+    np.testing.assert_array_equal(found, ScaleChain().position(problem, 0))
+    assert "scale_chain positions them instead" in capsys.readouterr().out
+    assert np.median(errors(found, truth.centers)) < 0.01 * np.ptp(truth.centers, axis=0).max()
+
+
+def test_recovery_at_one_scale_is_kept(capsys):
+    problem = positioning(make_problem(20, 800, "area", 0.5, 0.1, 0.3, 0.1, seed=2))
+    found = TranslationRecovery(reject_outliers="none").position(problem, 0)
+    assert np.isfinite(found).all() and not np.array_equal(found, ScaleChain().position(problem, 0))
+    assert capsys.readouterr().out == ""
