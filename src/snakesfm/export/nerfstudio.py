@@ -152,10 +152,13 @@ def _pixel_grid(camera: Camera) -> Array:
 def _fit_terms(camera: Camera) -> tuple[float, list[float], float]:
     """Focal scale and distortion terms fitted over a grid of pixels, and the largest error in pixels."""
     pixels = _pixel_grid(camera)
+    rays = camera.normalize(pixels)
+    # where distortion folds, pixels have none
+    told = np.isfinite(rays).all(axis=1)
+    pixels, (x, y) = pixels[told], rays[told].T
     matrix = camera.to_pycolmap().calibration_matrix()
     focal = matrix[[0, 1], [0, 1]]
     distorted = (pixels - matrix[:2, 2]) / focal
-    x, y = camera.normalize(pixels).T
     squared = x**2 + y**2
     if is_fisheye(camera):
         radius = np.sqrt(squared)
