@@ -72,11 +72,14 @@ class Reconstruction(Artifact):
     """The adjusted model: cameras, poses, points and observations."""
 
     kind: ClassVar[str] = "reconstruction"
-    format_version: ClassVar[int] = 3
+    format_version: ClassVar[int] = 4
 
     camera_models: Array = column("(C)", "str", "COLMAP camera model name")
     camera_sizes: Array = column("(C,2)", "int32", "width and height in pixels")
     camera_params: Array = column("(C,16)", "float64", "COLMAP parameters in pixels, padded with NaN")
+    camera_resets: Array = column(
+        "(C)", "str", "what was not plausible of a camera that the last pass reset and held; else empty"
+    )
     rotations: Array = column("(N,3,3)", "float64", "cam_from_world; NaN where not registered")
     translations: Array = column("(N,3)", "float64", "cam_from_world; NaN where not registered")
     models: Array = column("(N)", "int32", "images of one share a world; 0 the largest, -1 none")

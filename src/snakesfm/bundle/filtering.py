@@ -1,15 +1,11 @@
-"""What is taken out of the model between rounds: observations, points, images, and intrinsics gone wild."""
+"""What is taken out of the model between rounds: observations, points and images."""
 
 import heapq
 from collections import Counter
-from collections.abc import Collection, Sequence
+from collections.abc import Collection
 
 import cv2  # noqa: F401 - must be loaded before pycolmap, whose PNG library clashes otherwise
 import pycolmap
-
-from snakesfm.geometry.camera import Camera
-
-USUAL_FOCAL_RATIO = 1.2
 
 
 def filter_observations(
@@ -93,16 +89,6 @@ def deregister_weak_images(reconstruction: pycolmap.Reconstruction, min_observat
     return taken
 
 
-def usual_focal_px(camera: Camera) -> float:
-    """The focal length of a lens that is neither wide nor long, for images of the camera's size."""
-    return USUAL_FOCAL_RATIO * max(camera.width, camera.height)
-
-
-def is_guessed(camera: Camera) -> bool:
-    """Whether a focal length is neither given nor from EXIF."""
-    return camera.source not in ("given", "exif")
-
-
 def deregister_images_alone(
     reconstruction: pycolmap.Reconstruction, camera_ids: Collection[int]
 ) -> frozenset[int]:
@@ -125,41 +111,3 @@ def deregister_images_alone(
 def images_of(reconstruction: pycolmap.Reconstruction, camera_id: int) -> list[int]:
     """Ids of the registered images of a camera."""
     return [k for k in reconstruction.reg_image_ids() if reconstruction.image(k).camera_id == camera_id]
-
-
-def reset_wild_cameras(
-    reconstruction: pycolmap.Reconstruction,
-    cameras: Sequence[Camera],
-    max_focal_change: float,
-    max_guessed_focal_change: float,
-    max_distortion: float,
-) -> frozenset[int]:
-    """Give cameras whose intrinsics left what is plausible their first ones back; the ids of these.
-
-    Parameters
-    ----------
-    reconstruction : changed in place.
-    cameras : the intrinsics before any adjustment.
-    max_focal_change : factor up or down, of a focal length that was given or in EXIF.
-    max_guessed_focal_change : factor of a usual focal length for all others; what matches tell of a long
-        lens is several times too short.
-    max_distortion : largest absolute value of a distortion parameter of a view as wide as the default one.
-    """
-    wild = set()
-    for row, start in enumerate(cameras):
-        camera = reconstruction.camera(row + 1)
-        focal = camera.mean_focal_length()
-        usual = usual_focal_px(start)
-        if is_guessed(start):
-            change, most = focal / usual, max_guessed_focal_change
-        else:
-            change, most = focal / start.focal_px, max_focal_change
-        # distortion counts in squared tangents, which are small in a narrow view
-        narrow = max(1.0, focal / usual) ** 2
-        extra = camera.extra_params_idxs()
-        distortion = max((abs(camera.params[k]) for k in extra), default=0.0)
-        allowed = max([max_distortion * narrow, *(abs(start.params[k]) for k in extra)])
-        if not 1 / most <= change <= most or distortion > allowed:
-            camera.params = list(start.params)
-            wild.add(row + 1)
-    return frozenset(wild)

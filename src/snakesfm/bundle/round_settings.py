@@ -1,9 +1,11 @@
 """What the rounds of bundle adjustment are told, and what they say of themselves."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
 from snakesfm.bundle.interface import Loss
+from snakesfm.bundle.wild_cameras import WildCause
 
 
 @dataclass(frozen=True)
@@ -48,10 +50,13 @@ class RoundSettings:
 class RoundRecord:
     """What one round did: robust costs before and after, and the model's size and mean error after it.
 
-    Where nothing was adjusted, the costs are that of the pass before.
+    Where nothing was adjusted, the costs are that of the pass before. ``wild`` tells by the camera's id
+    what was not plausible of cameras that were reset, and ``held`` the same of those that are held since.
     """
 
     name: str
     costs: tuple[float, float]
     counts: tuple[int, int, int]
     error_px: float
+    wild: Mapping[int, WildCause]
+    held: Mapping[int, WildCause]

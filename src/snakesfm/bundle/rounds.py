@@ -1,6 +1,6 @@
 """The chained rounds of bundle adjustment."""
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence, Set
 from dataclasses import replace
 from typing import Literal
 
@@ -14,9 +14,6 @@ from snakesfm.bundle.filtering import (
     deregister_weak_images,
     drop_short_tracks,
     filter_observations,
-    is_guessed,
-    reset_wild_cameras,
-    usual_focal_px,
 )
 from snakesfm.bundle.image_sources import ImageSource
 from snakesfm.bundle.interface import BundleAdjuster, SolverSettings
@@ -26,6 +23,7 @@ from snakesfm.bundle.principal_points import find_told_cameras
 from snakesfm.bundle.registration import left_out_images, register_left_out
 from snakesfm.bundle.round_settings import RoundRecord, RoundSettings
 from snakesfm.bundle.selection import adjust_selection
+from snakesfm.bundle.wild_cameras import WildCause, is_guessed, reset_wild_cameras, usual_focal_px
 from snakesfm.geometry.camera import Camera
 
 EARLY_TOLERANCE = 300.0
@@ -153,24 +151,29 @@ class _Mapper:
                 and len(self.records) + 1 >= settings.distortion_from_round,
             )
         drop_short_tracks(self.reconstruction, settings.min_track_length, settings.sparse_observations)
+        before = {k: list(camera.params) for k, camera in self.reconstruction.cameras.items()}
         costs = self.solve(solving, phase)
         wild = reset_wild_cameras(
             self.reconstruction,
             self.cameras,
+            before,
             settings.max_focal_change,
             settings.max_guessed_focal_change,
             settings.max_distortion,
         )
+        gone: Set[int] = frozenset()
         if wild:
             if phase == "last" and settings.register_images:
-                # no pass is left for them to come back in: their images are added to the finished model
-                wild = deregister_images_alone(self.reconstruction, wild)
-            held = solving.constant_cameras | wild
-            costs = self.solve(replace(solving, constant_cameras=held), phase)
+                # no pass is left for their focal lengths: their images are added to the finished model
+                stray = {camera_id for camera_id, cause in wild.items() if cause == "focal length"}
+                gone = stray - deregister_images_alone(self.reconstruction, stray)
+            constant = solving.constant_cameras | frozenset(wild)
+            costs = self.solve(replace(solving, constant_cameras=constant), phase)
         self.filter(threshold_px)
         if phase != "early":
             deregister_weak_images(self.reconstruction, settings.min_observations)
-        self.record(name, costs)
+        held = {camera_id: cause for camera_id, cause in wild.items() if camera_id not in gone}
+        self.record(name, costs, wild, held)
 
     def prepare(self, completing: bool, sources: Sequence[ImageSource]) -> None:
         """What comes before a round: tracks are completed, and keypoints refined by each of ``sources``."""
@@ -200,7 +203,13 @@ class _Mapper:
             self.cameras[camera_id - 1] = replace(camera, source=self.cameras[camera_id - 1].source)
         return bool(wider)
 
-    def record(self, name: str, costs: tuple[float, float]) -> None:
+    def record(
+        self,
+        name: str,
+        costs: tuple[float, float],
+        wild: Mapping[int, WildCause],
+        held: Mapping[int, WildCause],
+    ) -> None:
         """Take down what was done, and report it."""
         self.reconstruction.update_point_3d_errors()
         record = RoundRecord(
@@ -212,6 +221,8 @@ class _Mapper:
                 self.reconstruction.compute_num_observations(),
             ),
             float(self.reconstruction.compute_mean_reprojection_error()),
+            wild,
+            held,
         )
         self.records.append(record)
         self.report(record)
@@ -319,7 +330,8 @@ class _Mapper:
         settings = self.settings
         least = max(settings.register_min_inliers, settings.min_observations)
         if self.place_left_out(settings.thresholds_px[-1], least):
-            self.record("left-out images", (self.records[-1].costs[1],) * 2)
+            last = self.records[-1]
+            self.record("left-out images", (last.costs[1],) * 2, {}, last.held)
 
     def place_left_out(
         self, max_error_px: float, min_inliers: int, refused: Collection[int] = ()

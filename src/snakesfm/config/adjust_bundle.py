@@ -70,7 +70,7 @@ class AdjustBundleOptions(StageOptions):
     """The same without EXIF, as a factor of 1.2 times the longer side."""
 
     max_distortion: float = Field(default=1.0, gt=0.0)
-    """Largest distortion parameter before the camera is reset and held; larger in a narrow view."""
+    """Largest distortion by all terms, as a k of SIMPLE_RADIAL, before the camera is reset and held."""
 
     complete_tracks: bool = True
     """Between rounds, add observations to points, merge points, and make points of left-out matches."""

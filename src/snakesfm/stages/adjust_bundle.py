@@ -28,6 +28,7 @@ from snakesfm.bundle.models import join_models, restrict_to, tied_images
 from snakesfm.bundle.reading import observed_keypoints
 from snakesfm.bundle.round_settings import RoundRecord, RoundSettings
 from snakesfm.bundle.rounds import adjust_rounds
+from snakesfm.bundle.wild_cameras import WildCause
 from snakesfm.errors import SceneError
 from snakesfm.geometry.camera import cameras_from_columns, cameras_to_columns
 from snakesfm.geometry.detector_pixels import (
@@ -45,6 +46,8 @@ if TYPE_CHECKING:
 
 SMALLEST_FURTHER_MODEL = 3
 USUAL_ITERATIONS = 50
+# of cameras that were reset, in a line of the log
+MOST_NAMED = 20
 
 
 def run(job: StageJob) -> None:
@@ -74,6 +77,7 @@ def run(job: StageJob) -> None:
     cameras, taken = poses.cameras, np.zeros(len(index.names), dtype=bool)
     adjusted: list[tuple[BundleModel, np.ndarray]] = []
     records: list[RoundRecord] = []
+    resets: dict[int, WildCause] = {}
     for component in range(int(averaged.components.max(initial=0)) + 1):
         mine = (averaged.components == component) & ~taken
         part = restrict_to(replace(poses, cameras=cameras), mine)
@@ -89,6 +93,7 @@ def run(job: StageJob) -> None:
         prefix = f"part {component + 1}, " if component else ""
         result, observed, rounds = _adjust(job, index, part, graph, refused, taken, prefix)
         records += rounds
+        resets |= rounds[-1].held
         cameras = result.cameras
         if result.registered.sum() >= 2:
             adjusted.append((result, observed))
@@ -104,7 +109,7 @@ def run(job: StageJob) -> None:
     joined, models = join_models([found for found, _ in adjusted], final)
     pixels = np.concatenate([observed for _, observed in adjusted])
     scales = detector_scales(index.sizes, job.settings).astype(np.float32)
-    _write(job, joined, models, pixels * scales[joined.image_ids, None], records)
+    _write(job, joined, models, pixels * scales[joined.image_ids, None], records, resets)
 
 
 def _adjust(
@@ -221,6 +226,11 @@ def _image_sources(job: StageJob, index: ImageIndex) -> list[ImageSource]:
 
 
 def _print_record(record: RoundRecord) -> None:
+    for cause in sorted(set(record.wild.values())):
+        ids = sorted(camera_id for camera_id, what in record.wild.items() if what == cause)
+        more = f" and {len(ids) - MOST_NAMED} more" if len(ids) > MOST_NAMED else ""
+        named = ", ".join(str(camera_id) for camera_id in ids[:MOST_NAMED])
+        print(f"{record.name}: cameras reset as their {cause} was not plausible: {named}{more}")
     images, points, observations = record.counts
     print(
         f"{record.name}: cost {record.costs[0]:.1f} -> {record.costs[1]:.1f}, {images} images, "
@@ -235,6 +245,7 @@ def _write(
     models: np.ndarray,
     observed: np.ndarray,
     records: list[RoundRecord],
+    resets: dict[int, WildCause],
 ) -> None:
     (colors,) = gather_image_columns(job.paths("features"), len(model.camera_ids), "colors")
     base = np.r_[0, np.cumsum([len(k) for k in colors])]
@@ -244,6 +255,7 @@ def _write(
         camera_models=np.array(camera_models),
         camera_sizes=sizes,
         camera_params=params,
+        camera_resets=np.array([resets.get(row + 1, "") for row in range(len(model.cameras))]),
         rotations=model.rotations,
         translations=model.translations,
         models=models,

@@ -62,6 +62,11 @@ OTHER_LENS = (
     "another distortion: another index_images.camera_model (RADIAL, OPENCV) or other intrinsics may fit it."
 )
 
+RESET_CAMERA = (
+    "camera {camera} ({model}): its {cause} was not plausible in the last pass of bundle adjustment, so it "
+    "was reset and held: an index_images.camera_model of fewer terms, or other intrinsics, may fit it."
+)
+
 # more of them tell no more of a lens
 OBSERVATIONS_OF_LENSES = 500_000
 
@@ -78,6 +83,11 @@ def run(job: StageJob) -> None:
     registered = registered_images(model.rotations, model.translations)
     used = sorted({int(index.camera_ids[row]) for row in registered})
     warnings = [line for row in used for line in camera_warnings(cameras[row], row + 1)]
+    warnings += [
+        RESET_CAMERA.format(camera=row + 1, model=cameras[row].model, cause=adjusted.camera_resets[row])
+        for row in used
+        if adjusted.camera_resets[row]
+    ]
     warnings += _lens_warnings(model, cameras, index.camera_ids)
     if len({is_fisheye(cameras[row]) for row in used}) > 1:
         warnings.append(MIXED_LENSES)

@@ -56,9 +56,10 @@ def test_a_camera_gone_wild_is_free_again_in_the_next_pass(passes, monkeypatch):
     reset = rounds.reset_wild_cameras
     calls = []
 
-    def once(reconstruction, cameras, *limits):
+    def once(reconstruction, cameras, before, *limits):
         calls.append(limits)
-        return reset(reconstruction, cameras, *((1.01, 1.01, 1.0) if len(calls) == 1 else limits))
+        limits = (1.01, 1.01, 1.0) if len(calls) == 1 else limits
+        return reset(reconstruction, cameras, before, *limits)
 
     monkeypatch.setattr(rounds, "reset_wild_cameras", once)
     params = adjusted()
@@ -68,6 +69,42 @@ def test_a_camera_gone_wild_is_free_again_in_the_next_pass(passes, monkeypatch):
 
 def test_a_camera_that_is_always_wild_keeps_its_first_intrinsics():
     np.testing.assert_array_equal(adjusted(max_guessed_focal_change=1.001), START.params)
+
+
+def bent(model, terms, **changes):
+    """The first camera that rounds find from nothing but the true focal length, the truth, and the rounds."""
+    true = Camera(model, 640, 480, (500.0, 500.0, 320.0, 240.0, *terms), "estimated")
+    made = make_problem(12, 600, noise_px=0.2, camera=true, seed=5)
+    start = replace(true, params=true.params[:4] + (0.0,) * len(terms))
+    settings = {"refine_principal_points": False} | changes
+    found, records = run_rounds(made, replace(true_model(made), cameras=(start,)), **settings)
+    return found.cameras[0], true, records
+
+
+@pytest.mark.parametrize(
+    ("model", "terms"),
+    [
+        ("OPENCV", (-0.2, 1.5, 0.0, 0.0)),
+        ("FULL_OPENCV", (-0.116, 1.038, 0.002, -0.003, -1.547, 0.127, 0.835, -1.66)),
+        ("OPENCV_FISHEYE", (0.1, -0.08, 1.76, -1.88)),
+    ],
+)
+def test_large_terms_that_make_up_for_each_other_are_no_wild_distortion(model, terms):
+    found, true, records = bent(model, terms)
+    assert not any(record.wild for record in records)
+    radii = np.linspace(0.05, 0.45, 9)
+    rays = np.column_stack([radii, 0.5 * radii, np.ones(9)])
+    assert (
+        np.abs(found.to_pycolmap().img_from_cam(rays) - true.to_pycolmap().img_from_cam(rays)).max() < 1.0
+    )
+
+
+def test_rounds_tell_of_cameras_that_were_reset_and_held():
+    found, true, records = bent("OPENCV", (-0.2, 0.1, 0.0, 0.0), max_distortion=0.05)
+    assert found.params[4:] == (0.0,) * 4
+    assert abs(found.params[0] / true.params[0] - 1) < 0.1
+    assert [dict(record.wild) for record in records] == [{}, *[{1: "distortion"}] * 3]
+    assert records[-1].held == {1: "distortion"}
 
 
 def test_final_passes_iterate_within_their_steps_and_only_the_last_is_solved_to_the_end(passes):

@@ -9,16 +9,10 @@ import pytest
 from synthetic_scene import graph_of, run_rounds
 
 from snakesfm.bundle.completion import TrackCompleter, drop_repeated_observations
-from snakesfm.bundle.filtering import (
-    deregister_weak_images,
-    drop_short_tracks,
-    filter_observations,
-    reset_wild_cameras,
-)
+from snakesfm.bundle.filtering import deregister_weak_images, drop_short_tracks, filter_observations
 from snakesfm.bundle.interface import SolverSettings
 from snakesfm.bundle.model import BundleModel, from_reconstruction, reprojection_errors, to_reconstruction
 from snakesfm.bundle.registration import register_left_out
-from snakesfm.geometry.camera import Camera
 from snakesfm.geometry.poses import translation_of
 from snakesfm.geometry.rotations import angle_of
 from snakesfm.synthetic.problems import make_problem, perturb_rotations
@@ -133,31 +127,6 @@ def test_weak_images_are_taken_out():
     reconstruction = to_reconstruction(model_of(made, keep=few), made.keypoints, NAMES)
     assert deregister_weak_images(reconstruction, 10) == [2]
     assert sorted(reconstruction.reg_image_ids()) == [k + 1 for k in range(12) if k != 2]
-
-
-@pytest.mark.parametrize(
-    ("params", "source", "wild"),
-    [
-        ((500.0, 320.0, 240.0, 0.1), "exif", False),
-        ((1600.0, 320.0, 240.0, 0.1), "exif", True),
-        ((1600.0, 320.0, 240.0, 0.1), "default", False),
-        ((11000.0, 320.0, 240.0, 0.1), "estimated", False),
-        ((12000.0, 320.0, 240.0, 0.1), "estimated", True),
-        ((55.0, 320.0, 240.0, 0.1), "estimated", False),
-        ((50.0, 320.0, 240.0, 0.1), "estimated", True),
-        ((500.0, 320.0, 240.0, -1.5), "default", True),
-        ((5000.0, 320.0, 240.0, -30.0), "default", False),
-        ((5000.0, 320.0, 240.0, -50.0), "default", True),
-    ],
-)
-def test_wild_cameras_are_reset(params, source, wild):
-    made = problem()
-    start = Camera("SIMPLE_RADIAL", 640, 480, (500.0, 320.0, 240.0, 0.0), source)
-    model = replace(model_of(made), cameras=(replace(start, params=params),))
-    reconstruction = to_reconstruction(model, made.keypoints, NAMES)
-    assert reset_wild_cameras(reconstruction, [start], 3.0, 15.0, 1.0) == ({1} if wild else set())
-    if wild:
-        assert tuple(reconstruction.camera(1).params) == start.params
 
 
 @pytest.mark.parametrize("min_angle_deg", [1.0, 0.0])

@@ -90,13 +90,17 @@ def test_an_image_that_leaves_in_the_last_pass_is_added_to_the_finished_model(mo
     def wild_at_last(reconstruction, *_):
         passes.append(None)
         if len(passes) < 4:
-            return frozenset()
+            return {}
         reconstruction.camera(7).params = [120.0, 320.0, 240.0, 0.0]
-        return frozenset([7])
+        return {7: "focal length"}
 
     monkeypatch.setattr(rounds, "reset_wild_cameras", wild_at_last)
     found, records = adjusted(made, model)
     assert [record.name for record in records[-2:]] == ["last pass", "left-out images"]
+    assert [(dict(record.wild), dict(record.held)) for record in records[-2:]] == [
+        ({7: "focal length"}, {}),
+        ({}, {}),
+    ]
     assert found.registered.all()
     assert abs(found.cameras[6].focal_px / truly.cameras[6].focal_px - 1) < 0.02
     turned = found.rotations[6] @ found.rotations[0].T @ made.rotations[0] @ made.rotations[6].T

@@ -87,8 +87,10 @@ def write_index(
     return folder / "index.h5"
 
 
-def write_reconstruction(folder: Path, problem: SyntheticProblem, lost: Iterable[int] = (LOST,)) -> Path:
-    """The truth as a finished model, ``lost`` images of it not registered."""
+def write_reconstruction(
+    folder: Path, problem: SyntheticProblem, lost: Iterable[int] = (LOST,), reset: str = ""
+) -> Path:
+    """The truth as a finished model, ``lost`` images not registered, the second camera's ``reset`` held."""
     rotations, translations = problem.rotations.copy(), problem.translations.copy()
     rotations[list(lost)], translations[list(lost)] = np.nan, np.nan
     keep = ~np.isin(problem.track_image_ids, list(lost))
@@ -100,6 +102,7 @@ def write_reconstruction(folder: Path, problem: SyntheticProblem, lost: Iterable
         camera_models=models,
         camera_sizes=sizes,
         camera_params=params,
+        camera_resets=["", reset],
         rotations=rotations,
         translations=translations,
         models=np.where(np.isin(np.arange(COUNT), list(lost)), -1, 0),
@@ -132,11 +135,12 @@ def export(
     lost: Iterable[int] = (LOST,),
     gps: np.ndarray | None = None,
     masks: Path | None = None,
+    reset: str = "",
     **options: bool,
 ) -> Path:
     inputs = {
         "index": str(write_index(tmp_path, orientations, gps)),
-        "reconstruction": str(write_reconstruction(tmp_path, problem, lost)),
+        "reconstruction": str(write_reconstruction(tmp_path, problem, lost, reset)),
     }
     folder = tmp_path / "out" / "scene" / "export_model"
     images = tmp_path / "photos"
@@ -331,6 +335,15 @@ def test_a_lens_of_another_distortion_is_warned_of(tmp_path, distortion: float, 
     found = [line for line in summary["warnings"] if "has another distortion" in line]
     assert len(found) == told
     assert all(line.startswith("camera 1 (SIMPLE_RADIAL)") for line in found)
+
+
+@pytest.mark.parametrize(("reset", "told"), [("", 0), ("distortion", 1)])
+def test_a_camera_that_was_reset_and_held_is_warned_of(tmp_path, problem, reset: str, told: int) -> None:
+    folder = export(tmp_path, problem, reset=reset)
+    summary = json.loads((folder / "summary.json").read_text("utf-8"))
+    found = [line for line in summary["warnings"] if "reset and held" in line]
+    assert len(found) == told
+    assert all(line.startswith("camera 2 (SIMPLE_RADIAL): its distortion was") for line in found)
 
 
 def test_masks_go_with_the_images_where_all_have_one_of_their_size(tmp_path, problem) -> None:

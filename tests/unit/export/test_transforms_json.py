@@ -158,6 +158,14 @@ def test_distortion_that_folds_is_warned_of() -> None:
     assert "not invertible" in warning
 
 
+def test_a_distortion_that_folds_is_fitted_where_pixels_have_rays() -> None:
+    terms = (-1.2, 0.0, 0.0, 0.0, 0.0, 0.01, 0.0, 0.0)
+    camera = Camera("FULL_OPENCV", *SIZE, (300.0, 300.0, 320.0, 240.0, *terms))
+    content = camera_intrinsics(camera)
+    assert -1.5 < content["k1"] < -0.5
+    assert 250.0 < content["fl_x"] < 350.0
+
+
 def test_a_distortion_that_cannot_be_written_says_by_how_much() -> None:
     terms = (0.0, 0.0, 0.01, 0.01, 0.0, 0.0, 0.0, 0.0)
     camera = Camera("THIN_PRISM_FISHEYE", *SIZE, (300.0, 300.0, 320.0, 240.0, *terms))

@@ -106,6 +106,20 @@ def test_stages_in_a_row(made, inputs, tmp_path, capsys):
     )
 
 
+@pytest.mark.parametrize(("most", "told"), [(3.0, ""), (1.0 + 1e-9, "focal length")])
+def test_cameras_that_were_reset_are_told_of(made, inputs, tmp_path, capsys, most, told):
+    run_all(inputs, tmp_path)
+    options = AdjustBundleOptions(max_focal_change=most, refine_keypoints=False)
+    capsys.readouterr()
+    run(adjust_bundle, options, inputs, tmp_path / "model.h5", intrinsics="refine")
+    model = Reconstruction.read(tmp_path / "model.h5")
+    assert model.camera_resets.tolist() == [told]
+    assert (model.camera_params[0, 0] == made.cameras[0].params[0]) == bool(told)
+    lines = [line for line in capsys.readouterr().out.splitlines() if "cameras reset" in line]
+    names = ["round 1", "round 2", "round 3", "registration", "last pass"] if told else []
+    assert lines == [f"{name}: cameras reset as their focal length was not plausible: 1" for name in names]
+
+
 def test_larger_photographs_give_the_same_model(made, inputs, tmp_path):
     """Four is a power of two, so all numbers are the same but for their exponents."""
     small = run_all(inputs, tmp_path, refine_keypoints=False)
