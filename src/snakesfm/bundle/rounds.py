@@ -15,6 +15,7 @@ from snakesfm.bundle.filtering import (
     drop_short_tracks,
     filter_observations,
 )
+from snakesfm.bundle.focal_pairs import skewed_cameras, with_one_focal, with_two_focals
 from snakesfm.bundle.image_sources import ImageSource
 from snakesfm.bundle.interface import BundleAdjuster, SolverSettings
 from snakesfm.bundle.keypoint_refinement import refine_keypoints
@@ -93,6 +94,7 @@ def adjust_rounds(
     if settings.register_images:
         mapper.set_long_lenses_aside()
     mapper.round("last pass", settings.thresholds_px[-1], "last")
+    mapper.tie_focal_lengths()
     if settings.register_images:
         mapper.add_left_out()
     return mapper.records
@@ -202,6 +204,22 @@ class _Mapper:
             # what went wild later would else go back to the former model
             self.cameras[camera_id - 1] = replace(camera, source=self.cameras[camera_id - 1].source)
         return bool(wider)
+
+    def tie_focal_lengths(self) -> None:
+        """Adjust once more with one focal length where two came apart that the images do not tell."""
+        skewed = skewed_cameras(self.reconstruction, self.cameras)
+        if not skewed or self.settings.solver != "ceres":
+            return
+        starts = list(self.cameras)
+        for camera_id in skewed:
+            camera = Camera.of_pycolmap(self.reconstruction.camera(camera_id))
+            set_camera(self.reconstruction, camera_id, with_one_focal(camera))
+            self.cameras[camera_id - 1] = with_one_focal(starts[camera_id - 1])
+        self.round("last pass with one focal length", self.settings.thresholds_px[-1], "last")
+        for camera_id in skewed:
+            camera = Camera.of_pycolmap(self.reconstruction.camera(camera_id))
+            set_camera(self.reconstruction, camera_id, with_two_focals(camera, starts[camera_id - 1].model))
+        self.cameras = starts
 
     def record(
         self,

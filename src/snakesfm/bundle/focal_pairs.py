@@ -1,0 +1,62 @@
+"""Cameras of two focal lengths whose images tell one of them alone.
+
+Where all cameras stand upright at one height, as around an object or along a street, the vertical focal
+length trades with the height of the world: nothing in the images tells the two apart. Sensors have square
+pixels, so two focal lengths that come out different are a sign of it.
+"""
+
+from collections.abc import Sequence
+
+import cv2  # noqa: F401 - must be loaded before pycolmap, whose PNG library clashes otherwise
+import pycolmap
+
+from snakesfm.geometry.camera import Camera
+
+ONE_FOCAL_MODELS = {
+    "PINHOLE": "SIMPLE_PINHOLE",
+    "OPENCV": "RADIAL",
+    "FULL_OPENCV": "RADIAL",
+    "OPENCV_FISHEYE": "RADIAL_FISHEYE",
+    "THIN_PRISM_FISHEYE": "RADIAL_FISHEYE",
+}
+"""Of each model of two focal lengths the one with one and the same first terms of distortion."""
+MAX_SKEW = 0.02
+"""Difference of two focal lengths that is taken for real; calibrated lenses stay within a tenth of it."""
+SQUARE = 1e-6
+
+
+def skewed_cameras(reconstruction: pycolmap.Reconstruction, cameras: Sequence[Camera]) -> list[int]:
+    """Ids of cameras whose focal lengths were one and came apart.
+
+    Parameters
+    ----------
+    reconstruction : an adjusted model.
+    cameras : the intrinsics before any adjustment.
+    """
+    return [
+        row + 1
+        for row, start in enumerate(cameras)
+        if start.model in ONE_FOCAL_MODELS
+        and _skew(start) < SQUARE
+        and _skew(Camera.of_pycolmap(reconstruction.camera(row + 1))) > MAX_SKEW
+    ]
+
+
+def _skew(camera: Camera) -> float:
+    return abs(camera.params[1] / camera.params[0] - 1.0)
+
+
+def with_one_focal(camera: Camera) -> Camera:
+    """A camera of two focal lengths with the horizontal one alone, and its radial terms."""
+    model = ONE_FOCAL_MODELS[camera.model]
+    f, _, cx, cy, *terms = camera.params
+    count = len(pycolmap.Camera.create_from_model_name(1, model, f, 1, 1).extra_params_idxs())
+    return Camera(model, camera.width, camera.height, (f, cx, cy, *terms[:count]), camera.source)
+
+
+def with_two_focals(camera: Camera, model: str) -> Camera:
+    """A camera of one focal length as one of two, whose other terms are zero."""
+    f, cx, cy, *terms = camera.params
+    count = len(pycolmap.Camera.create_from_model_name(1, model, f, 1, 1).extra_params_idxs())
+    padded = (*terms, *[0.0] * (count - len(terms)))
+    return Camera(model, camera.width, camera.height, (f, f, cx, cy, *padded), camera.source)
