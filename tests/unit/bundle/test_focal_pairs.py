@@ -1,0 +1,86 @@
+"""Cameras of two focal lengths whose images tell one of them alone."""
+
+from dataclasses import replace
+
+import numpy as np
+import pycolmap
+import pytest
+from synthetic_scene import run_rounds, true_model
+
+from snakesfm.bundle.focal_pairs import (
+    ONE_FOCAL_MODELS,
+    skewed_cameras,
+    with_one_focal,
+    with_two_focals,
+)
+from snakesfm.geometry.camera import Camera
+from snakesfm.synthetic import layouts
+from snakesfm.synthetic.problems import make_problem
+
+PIXELS = np.random.default_rng(0).uniform([0, 0], [640, 480], (50, 2))
+
+
+def camera_of(model, fx, fy, terms=()):
+    count = len(pycolmap.Camera.create_from_model_name(1, model, fx, 640, 480).params)
+    return Camera(
+        model, 640, 480, (fx, fy, 320.0, 240.0, *terms, *[0.0] * (count - 4 - len(terms))), "exif"
+    )
+
+
+@pytest.mark.parametrize("model", sorted(ONE_FOCAL_MODELS))
+def test_one_focal_length_and_back_is_the_same_lens(model):
+    terms = () if model == "PINHOLE" else (0.05, -0.02)
+    camera = camera_of(model, 500.0, 500.0, terms)
+    one = with_one_focal(camera)
+    assert one.model == ONE_FOCAL_MODELS[model]
+    assert one.source == "exif"
+    np.testing.assert_allclose(one.normalize(PIXELS), camera.normalize(PIXELS), atol=1e-9)
+    again = with_two_focals(one, model)
+    assert again == camera
+
+
+def test_only_focal_lengths_that_were_one_and_came_apart_are_tied():
+    starts = [
+        camera_of("OPENCV", 500.0, 500.0),
+        camera_of("OPENCV", 500.0, 500.0),
+        camera_of("PINHOLE", 500.0, 450.0),
+        Camera("SIMPLE_RADIAL", 640, 480, (500.0, 320.0, 240.0, 0.0), "exif"),
+        camera_of("OPENCV_FISHEYE", 300.0, 300.0),
+    ]
+    found = [(520.0, 515.0), (520.0, 480.0), (520.0, 430.0), None, (300.0, 320.0)]
+    reconstruction = pycolmap.Reconstruction()
+    for row, (start, focals) in enumerate(zip(starts, found, strict=True)):
+        params = start.params if focals is None else (*focals, *start.params[2:])
+        reconstruction.add_camera_with_trivial_rig(replace(start, params=params).to_pycolmap(row + 1))
+    assert skewed_cameras(reconstruction, starts) == [2, 5]
+
+
+def upright_ring(camera_count, point_count, rng):
+    """A turntable: cameras on a circle, at one height, that all look at the axis."""
+    angle = 2.0 * np.pi * np.arange(camera_count) / camera_count
+    centers = 4.0 * np.stack([np.cos(angle), np.sin(angle), np.zeros(camera_count)], axis=1)
+    normals = rng.normal(size=(point_count, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    points = normals * rng.uniform(1.2, 1.8, (point_count, 1))
+    rotations = layouts.look_at(centers, np.zeros(3), np.array([0.0, 0.0, 1.0]))
+    return layouts.Scene(rotations, centers, points, normals)
+
+
+@pytest.mark.parametrize("model", ["PINHOLE", "OPENCV"])
+def test_upright_cameras_around_an_object_get_one_focal_length(model, monkeypatch):
+    monkeypatch.setitem(layouts.LAYOUTS, "ring", upright_ring)
+    true, start = camera_of(model, 500.0, 500.0), camera_of(model, 550.0, 550.0)
+    made = make_problem(16, 800, "ring", noise_px=0.3, camera=true, seed=3)
+    found, records = run_rounds(made, replace(true_model(made), cameras=(start,)))
+    fx, fy = found.cameras[0].params[:2]
+    assert found.cameras[0].model == model
+    assert fx == fy == pytest.approx(500.0, rel=0.01)
+    assert [record.name for record in records][-1] == "last pass with one focal length"
+
+
+def test_focal_lengths_that_the_images_tell_stay_two():
+    true = camera_of("PINHOLE", 500.0, 480.0)
+    made = make_problem(16, 800, "area", noise_px=0.3, camera=true, seed=3)
+    start = camera_of("PINHOLE", 500.0, 480.0 * 1.05)
+    found, _ = run_rounds(made, replace(true_model(made), cameras=(start,)))
+    np.testing.assert_allclose(found.cameras[0].params[:2], (500.0, 480.0), rtol=0.01)
