@@ -21,11 +21,13 @@ import traceback
 from collections.abc import Mapping
 from pathlib import Path
 
-from snakesfm import stages
+from snakesfm import run_pipe, stages
 from snakesfm.job import limit_library_threads, run_job
-from snakesfm.start import RUN_PIPE, VARIABLE, end_with, end_with_run
+from snakesfm.start import VARIABLE
 
 LARGEST_REQUEST = 1 << 20
+# bytes of a socket's address are 107 at most
+LONGEST_FOLDER = 90
 # stages import these only where they need them
 LIBRARIES = (
     "cv2",
@@ -42,25 +44,24 @@ class JobServer:
 
     def __init__(self) -> None:
         self.process: subprocess.Popen[bytes] | None = None
-        self.pipe: int | None = None
+        self.folder: Path | None = None
 
     def start(self, variables: Mapping[str, str]) -> None:
-        """Start the server and have the jobs of this process ask it.
+        """Start the server and have the jobs of this process ask it, and end with this process.
 
-        Does nothing where the environment already names a server, or ``off`` for none, and where there is
+        There is no server where the environment already names one, or ``off`` for none, and where there is
         no room for temporary files or another process.
 
         Parameters
         ----------
         variables : environment of the server, beside that of this process.
         """
-        if VARIABLE in os.environ:
-            return
         with contextlib.suppress(OSError):
-            # a folder that nobody else can enter
-            folder = Path(tempfile.mkdtemp(prefix="snakesfm-"))
-            address = str(folder / "jobs")
-            self.pipe = _hold_open(folder / RUN_PIPE)
+            self.folder = _make_folder()
+            run_pipe.hold_open(str(self.folder / "run"))
+            if VARIABLE in os.environ:
+                return
+            address = str(self.folder / "jobs")
             # this end of the pipe stays open until this process ends, however it ends
             self.process = subprocess.Popen(
                 [sys.executable, "-P", "-m", "snakesfm.job_server", address],
@@ -75,16 +76,17 @@ class JobServer:
         """End the server, whose processor time and that of its jobs then counts as this process's."""
         if self.process is not None:
             self.process.communicate()
+        if self.folder is not None:
+            shutil.rmtree(self.folder, ignore_errors=True)
 
 
-def _hold_open(path: Path) -> int:
-    """Make a named pipe, and open the end that is written to."""
-    os.mkfifo(path)
-    # to open it for writing alone would wait for a reader
-    reader = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
-    writer = os.open(path, os.O_WRONLY)
-    os.close(reader)
-    return writer
+def _make_folder() -> Path:
+    """A folder that nobody else can enter, whose name leaves room for that of a socket."""
+    folder = Path(tempfile.mkdtemp(prefix="snakesfm-"))
+    if len(os.fsencode(folder)) > LONGEST_FOLDER:
+        folder.rmdir()
+        folder = Path(tempfile.mkdtemp(prefix="snakesfm-", dir="/tmp"))
+    return folder
 
 
 def serve(address: str) -> None:
@@ -96,21 +98,20 @@ def serve(address: str) -> None:
     """
     # an interrupt from the terminal is for the jobs, also for one that is just being forked
     signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        _load_libraries()
-        with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as listener:
-            listener.bind(address)
-            listener.listen(64)
-            while sys.stdin not in select.select([sys.stdin, listener], [], [])[0]:
-                _forget_ended_jobs()
-                connection, _ = listener.accept()
-                with connection:
-                    if os.fork() == 0:
-                        listener.close()
-                        _become_job(connection)
+    _load_libraries()
+    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as listener:
+        listener.bind(address)
+        listener.listen(64)
+        while sys.stdin not in select.select([sys.stdin, listener], [], [])[0]:
             _forget_ended_jobs()
-    finally:
-        shutil.rmtree(Path(address).parent, ignore_errors=True)
+            connection, _ = listener.accept()
+            with connection:
+                if os.fork() == 0:
+                    listener.close()
+                    _become_job(connection)
+        _forget_ended_jobs()
+    # the run does it, too, but not where it was killed
+    shutil.rmtree(Path(address).parent, ignore_errors=True)
     # to take the libraries down would keep the run waiting for a tenth of a second
     os._exit(0)
 
@@ -135,7 +136,7 @@ def _become_job(connection: socket.socket) -> None:
     status = 1
     try:
         request, streams, _, _ = socket.recv_fds(connection, LARGEST_REQUEST, 3)
-        end_with(connection.fileno())
+        run_pipe.end_with(connection.fileno())
         signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
         for target, stream in enumerate(streams):
             os.dup2(stream, target)
@@ -145,7 +146,7 @@ def _become_job(connection: socket.socket) -> None:
         for variable in variables:
             name, _, value = variable.partition(b"=")
             os.environb[name] = value
-        end_with_run()
+        run_pipe.end_with_run()
         run_job(stage.decode())
         status = 0
     except KeyboardInterrupt:

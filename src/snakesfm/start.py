@@ -3,17 +3,15 @@
 Imports no more than it needs to ask the server, as this is what each job waits for.
 """
 
-import contextlib
-import fcntl
 import os
 import signal
 import socket
 import sys
 
+from snakesfm.run_pipe import end_with_run
+
 VARIABLE = "SNAKESFM_JOB_SERVER"
 NO_SERVER = "off"
-RUN_PIPE = "run"
-"""Beside the server's socket: a pipe that the run holds open, so that it ends when the run does."""
 
 
 def start_job(stage: str) -> None:
@@ -30,28 +28,6 @@ def start_job(stage: str) -> None:
     from snakesfm.job import run_job
 
     run_job(stage)
-
-
-def end_with_run() -> None:
-    """Have the system end this process, by SIGIO, when the run that it belongs to is gone.
-
-    A job that outlives its run would write over what the next run makes.
-    """
-    address = os.environ.get(VARIABLE, NO_SERVER)
-    if address == NO_SERVER:
-        return
-    with contextlib.suppress(OSError):
-        end_with(os.open(f"{address.rpartition('/')[0]}/{RUN_PIPE}", os.O_RDONLY | os.O_NONBLOCK))
-
-
-def end_with(file: int) -> None:
-    """Have the system end this process, by SIGIO, when nobody holds the other end of a pipe or socket."""
-    fcntl.fcntl(file, fcntl.F_SETOWN, os.getpid())
-    fcntl.fcntl(file, fcntl.F_SETFL, fcntl.fcntl(file, fcntl.F_GETFL) | os.O_ASYNC | os.O_NONBLOCK)
-    with contextlib.suppress(BlockingIOError):
-        # there may have been nobody before
-        if not os.read(file, 1):
-            os._exit(1)
 
 
 def fork_job(stage: str) -> int | None:

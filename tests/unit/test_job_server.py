@@ -11,8 +11,9 @@ from pathlib import Path
 
 import pytest
 
+from snakesfm import run_pipe
 from snakesfm.job_server import JobServer
-from snakesfm.start import NO_SERVER, RUN_PIPE, VARIABLE
+from snakesfm.start import NO_SERVER, VARIABLE
 
 Command = subprocess.Popen[str]
 CLIENT = "import sys; from snakesfm.start import fork_job; sys.exit(fork_job(sys.argv[1]) or 0)"
@@ -80,7 +81,11 @@ def ask(address: str) -> Iterator[Callable[[str], Command]]:
                 stdout=subprocess.PIPE,
                 stderr=subprocess.PIPE,
                 text=True,
-                env={**os.environ, VARIABLE: address},
+                env={
+                    **os.environ,
+                    VARIABLE: address,
+                    run_pipe.VARIABLE: str(Path(address).parent / "run"),
+                },
             )
         )
         return commands[-1]
@@ -164,16 +169,16 @@ def test_a_job_ends_with_its_command(parent: Command, ask) -> None:
 def test_jobs_end_with_the_run_though_their_commands_live(
     parent: Command, address: str, ask: Callable[[str], Command], tmp_path: Path
 ) -> None:
+    pipe = Path(address).parent / "run"
+    environment = {**os.environ, run_pipe.VARIABLE: str(pipe)}
     forked, job = waiting_job(parent, ask)
     script = Path(__file__).resolve().parents[2] / "scripts" / "index_images.py"
-    no_socket = str(Path(address).parent / "not_ready_yet")
     alone = subprocess.Popen(
         [sys.executable, str(script)],
         stdin=subprocess.PIPE,
-        env={**os.environ, VARIABLE: no_socket},
+        env={**environment, VARIABLE: NO_SERVER},
         text=True,
     )
-    pipe = Path(address).parent / RUN_PIPE
     wait_until(lambda: pipe in [file.readlink() for file in Path(f"/proc/{alone.pid}/fd").iterdir()])
     parent.kill()
     wait_until(lambda: has_ended(job))
@@ -181,19 +186,38 @@ def test_jobs_end_with_the_run_though_their_commands_live(
     alone.communicate(timeout=10)
     assert alone.returncode == -signal.SIGIO
     # and one that comes too late
-    Path(no_socket).parent.mkdir(exist_ok=True)
-    if not pipe.exists():
-        os.mkfifo(pipe)
+    wait_until(lambda: not pipe.parent.exists())
+    pipe.parent.mkdir()
+    os.mkfifo(pipe)
     late = subprocess.run(
         [sys.executable, str(script)],
         input=call_text(tmp_path / "out", tmp_path / "missing"),
-        env={**os.environ, VARIABLE: no_socket},
+        env={**environment, VARIABLE: NO_SERVER},
         text=True,
         capture_output=True,
         timeout=60,
         check=False,
     )
     assert (late.returncode, late.stderr) == (1, "")
+
+
+def test_a_long_name_of_the_folder_for_temporary_files_is_no_hindrance(tmp_path: Path) -> None:
+    folder = tmp_path / ("long" * 30)
+    folder.mkdir()
+    environment = {**os.environ, "TMPDIR": str(folder)}
+    environment.pop(VARIABLE, None)
+    with subprocess.Popen(
+        [sys.executable, "-c", PARENT],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+        env=environment,
+    ) as process:
+        address = Path(process.stdout.readline().strip())
+        wait_until(address.exists)
+        process.communicate("")
+    wait_until(lambda: not address.parent.exists())
+    assert list(folder.iterdir()) == []
 
 
 def test_an_interrupt_ends_jobs_and_not_the_server(parent: Command, ask) -> None:
@@ -243,8 +267,14 @@ def test_jobs_go_on_when_the_server_is_killed(
 def test_no_server_beside_another_one(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv(VARIABLE, NO_SERVER)
     monkeypatch.setenv("TMPDIR", str(tmp_path))
-    JobServer().start({})
+    monkeypatch.setenv(run_pipe.VARIABLE, "")
+    server = JobServer()
+    server.start({})
+    assert server.process is None
     assert os.environ[VARIABLE] == NO_SERVER
+    # but jobs end with the run all the same
+    assert Path(os.environ[run_pipe.VARIABLE]).is_fifo()
+    server.stop()
     assert list(tmp_path.iterdir()) == []
 
 
