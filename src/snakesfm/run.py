@@ -8,6 +8,7 @@ import re
 import subprocess
 import threading
 import time
+from collections.abc import Set
 from pathlib import Path
 from typing import Any
 
@@ -31,11 +32,16 @@ class Run:
         self.lock: Any = None
         self.slurm_run = ""
 
-    def refuse_unrecorded(self) -> None:
+    def refuse_unrecorded(self, asked: Set[str], keeps_records: bool = True) -> None:
         """Set aside what other images, options or seeds made and Snakemake knows nothing of.
 
         Before the jobs are planned, so that they are planned to be made again. What does not say of itself
         how it was made, as a model or a report, is made again and stays until then.
+
+        Parameters
+        ----------
+        asked : the words of Snakemake's command line, targets among them.
+        keeps_records : whether Snakemake will know of what this run makes; else it would be made each time.
 
         Raises
         ------
@@ -43,7 +49,7 @@ class Run:
         """
         self._refuse_locked()
         for scene in self.plan.scenes.values():
-            for path in unrecorded_files(scene.results()):
+            for path in unrecorded_files(scene.results(asked) if keeps_records else ()):
                 with contextlib.suppress(OSError):
                     forget(path)
             unknown = unrecorded_files(scene.artifacts())
@@ -240,7 +246,7 @@ class Run:
             database = Path(scene.database_file())
             made = f"COLMAP database in {database}, " if database.is_file() else ""
             former = self._is_outdated(scene)
-            model = "the model is of former images: 'all' makes it anew" if former else "no model yet"
+            model = "the model is older than its images: 'all' makes it anew" if former else "no model yet"
             return f"snakesfm: scene '{scene.name}': {made}{model}."
         others = summary.get("images_in_other_models", [])
         more = f" and {sum(others)} in {len(others)} models beside" if others else ""

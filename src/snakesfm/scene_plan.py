@@ -6,7 +6,7 @@ jobs is known before anything runs.
 
 import functools
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Set
 from pathlib import Path
 from typing import Any
 
@@ -52,6 +52,8 @@ STAGES_IN_DETECTOR_PIXELS = (
 )
 IMAGE_LISTS = ("images.txt", "images.bin")
 """Beside known cameras: which image is of which."""
+PARTIAL = frozenset(("--until", "-U", "--omit-from", "-O"))
+"""Words of Snakemake's command line by which it does not make all of its targets."""
 STAGES_WITH_NETWORKS = ("extract_features", "describe_images", "match_pairs")
 
 
@@ -273,9 +275,19 @@ class ScenePlan:
         names = ("features.h5", "matches.h5", "pairs.txt")
         return [str(self.folder / "export_hloc" / name) for name in names]
 
-    def results(self) -> list[str]:
-        """What is made for others, and does not say of itself how."""
-        return [*self.final_files(), self.database_file(), *self.hloc_files()]
+    def results(self, asked: Set[str]) -> list[str]:
+        """What a run makes for others that does not say of itself how it was made.
+
+        Parameters
+        ----------
+        asked : the words of Snakemake's command line, targets among them.
+        """
+        if asked & PARTIAL:
+            return []
+        databases, hloc = "databases" in asked, "hloc" in asked
+        files = [self.database_file()] if databases else []
+        files += self.hloc_files() if hloc else []
+        return files + (self.final_files() if "all" in asked or not (databases or hloc) else [])
 
     def all_files(self) -> list[str]:
         """What a run makes of the scene; Snakemake re-makes a lost file only if it is asked for by name."""

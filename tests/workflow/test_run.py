@@ -321,7 +321,7 @@ def test_a_model_of_former_images_is_not_called_this_run_s(finished, small_scene
     assert outcome.status == 0
     *_, line = outcome.summary
     assert "COLMAP database in out/square/export_database/database.db" in line
-    assert "the model is of former images" in line
+    assert "the model is older than its images" in line
     assert "registered" not in line
 
 

@@ -96,16 +96,16 @@ def deregister_images_alone(
 
     Returns
     -------
-    Ids of the cameras that still have images.
+    Ids of the cameras that are left without images.
     """
-    shared = set()
+    gone = set()
     for camera_id in camera_ids:
         images = images_of(reconstruction, camera_id)
         if len(images) == 1:
             reconstruction.deregister_frame(reconstruction.image(images[0]).frame_id)
-        elif images:
-            shared.add(camera_id)
-    return frozenset(shared)
+        if len(images) <= 1:
+            gone.add(camera_id)
+    return frozenset(gone)
 
 
 def images_of(reconstruction: pycolmap.Reconstruction, camera_id: int) -> list[int]:

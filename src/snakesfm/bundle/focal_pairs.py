@@ -1,15 +1,18 @@
 """Cameras of two focal lengths whose images tell one of them alone.
 
 Where all cameras stand upright at one height, as around an object or along a street, the vertical focal
-length trades with the height of the world: nothing in the images tells the two apart. Sensors have square
-pixels, so two focal lengths that come out different are a sign of it.
+length trades with the height of the world: nothing in the images tells the two apart. Most pixels are
+square, so two focal lengths that come out different are a sign of it, if one does as well. Where pixels are
+not, as of anamorphic video, the images tell.
 """
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 import cv2  # noqa: F401 - must be loaded before pycolmap, whose PNG library clashes otherwise
 import pycolmap
 
+from snakesfm.bundle.interface import BundleAdjuster, SolverSettings
+from snakesfm.bundle.lenses import set_camera
 from snakesfm.geometry.camera import Camera
 
 ONE_FOCAL_MODELS = {
@@ -23,6 +26,8 @@ ONE_FOCAL_MODELS = {
 MAX_SKEW = 0.02
 """Difference of two focal lengths that is taken for real; calibrated lenses stay within a tenth of it."""
 SQUARE = 1e-6
+MAX_ERROR_RATIO = 1.05
+"""Of mean reprojection errors with one focal length and with two, where one does as well."""
 
 
 def skewed_cameras(reconstruction: pycolmap.Reconstruction, cameras: Sequence[Camera]) -> list[int]:
@@ -40,6 +45,37 @@ def skewed_cameras(reconstruction: pycolmap.Reconstruction, cameras: Sequence[Ca
         and _skew(start) < SQUARE
         and _skew(Camera.of_pycolmap(reconstruction.camera(row + 1))) > MAX_SKEW
     ]
+
+
+def one_focal_serves(
+    reconstruction: pycolmap.Reconstruction,
+    camera_ids: Collection[int],
+    adjust: BundleAdjuster,
+    solving: SolverSettings,
+) -> bool:
+    """Whether cameras explain their images about as well with one focal length.
+
+    Parameters
+    ----------
+    reconstruction : an adjusted model; stays as it is.
+    camera_ids : of cameras of two focal lengths.
+    adjust, solving : the solver.
+    """
+    trial = pycolmap.Reconstruction(reconstruction)
+    for camera_id in camera_ids:
+        set_one_focal(trial, camera_id)
+    adjust(trial, solving)
+    errors = []
+    for model in (reconstruction, trial):
+        model.update_point_3d_errors()
+        errors.append(model.compute_mean_reprojection_error())
+    return bool(errors[1] <= MAX_ERROR_RATIO * errors[0])
+
+
+def set_one_focal(reconstruction: pycolmap.Reconstruction, camera_id: int) -> None:
+    """Give a camera of two focal lengths the model of :func:`with_one_focal`."""
+    camera = Camera.of_pycolmap(reconstruction.camera(camera_id))
+    set_camera(reconstruction, camera_id, with_one_focal(camera))
 
 
 def _skew(camera: Camera) -> float:

@@ -15,7 +15,13 @@ from snakesfm.bundle.filtering import (
     drop_short_tracks,
     filter_observations,
 )
-from snakesfm.bundle.focal_pairs import skewed_cameras, with_one_focal, with_two_focals
+from snakesfm.bundle.focal_pairs import (
+    one_focal_serves,
+    set_one_focal,
+    skewed_cameras,
+    with_one_focal,
+    with_two_focals,
+)
 from snakesfm.bundle.image_sources import ImageSource
 from snakesfm.bundle.interface import BundleAdjuster, SolverSettings
 from snakesfm.bundle.keypoint_refinement import refine_keypoints
@@ -168,7 +174,7 @@ class _Mapper:
             if phase == "last" and settings.register_images:
                 # no pass is left for their focal lengths: their images are added to the finished model
                 stray = {camera_id for camera_id, cause in wild.items() if cause == "focal length"}
-                gone = stray - deregister_images_alone(self.reconstruction, stray)
+                gone = deregister_images_alone(self.reconstruction, stray)
             constant = solving.constant_cameras | frozenset(wild)
             costs = self.solve(replace(solving, constant_cameras=constant), phase)
         self.filter(threshold_px)
@@ -207,15 +213,18 @@ class _Mapper:
 
     def tie_focal_lengths(self) -> None:
         """Adjust once more with one focal length where two came apart that the images do not tell."""
+        settings = self.settings
         skewed = skewed_cameras(self.reconstruction, self.cameras)
-        if not skewed or self.settings.solver != "ceres":
+        if not skewed or settings.solver != "ceres":
+            return
+        solving = replace(self.solving, loss=settings.last_loss, loss_scale_px=self.loss_scale_px())
+        if not one_focal_serves(self.reconstruction, skewed, self.adjust, solving):
             return
         starts = list(self.cameras)
         for camera_id in skewed:
-            camera = Camera.of_pycolmap(self.reconstruction.camera(camera_id))
-            set_camera(self.reconstruction, camera_id, with_one_focal(camera))
+            set_one_focal(self.reconstruction, camera_id)
             self.cameras[camera_id - 1] = with_one_focal(starts[camera_id - 1])
-        self.round("last pass with one focal length", self.settings.thresholds_px[-1], "last")
+        self.round("last pass with one focal length", settings.thresholds_px[-1], "last")
         for camera_id in skewed:
             camera = Camera.of_pycolmap(self.reconstruction.camera(camera_id))
             set_camera(self.reconstruction, camera_id, with_two_focals(camera, starts[camera_id - 1].model))

@@ -69,7 +69,9 @@ def look_at_pairs(pairs: Array, previews: Sequence[Array], count: int, threads: 
         values = []
         for i, j in part.tolist():
             fewer = min(len(previews[i]), len(previews[j]))
-            values.append(likeness(previews[i], previews[j]) * (count / fewer) if fewer > 1 else 0.0)
+            # of next to no keypoints, likeness is noise that must not stand out
+            scale = count / min(count, max(fewer, FEWEST_KEYPOINTS))
+            values.append(likeness(previews[i], previews[j]) * scale if fewer > 1 else 0.0)
         return values
 
     with ThreadPoolExecutor(threads) as pool:

@@ -89,8 +89,10 @@ def test_pairs_are_looked_at_one_by_one_whatever_the_threads(threads):
     expected = [likeness(previews[i], previews[j]) for i, j in pairs[1:4].tolist()]
     np.testing.assert_allclose(looked[1:4], expected, rtol=1e-6)
     assert looked[2] == pytest.approx(40.0) and looked[1] < 10
-    # as if there were as many as elsewhere
-    assert looked[4] == pytest.approx(40.0)
+    # as if there were as many as elsewhere, but not of next to no keypoints
+    assert looked[4] == pytest.approx(20.0)
+    most = [previews[0], previews[2]]
+    assert look_at_pairs(np.array([[0, 1]]), most, 80)[0] == pytest.approx(likeness(*most) * 80 / 50)
     assert look_at_pairs(np.zeros((0, 2), int), previews, 40, threads).shape == (0,)
 
 
