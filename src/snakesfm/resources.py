@@ -73,7 +73,8 @@ NEEDS = {
     "build_view_graph": Need("scene", 300, 0.01, 0.002, image_s=0.06),
     "filter_view_graph": Need("scene", 800, 0.02, 0.002, image_s=0.12),
     "average_rotations": Need("scene", 600, 0.05, 0.01, image_s=0.25),
-    "build_tracks": Need("scene", 400, 1.2, 0.02, image_s=0.2),
+    # 120 bytes per match, of which pairs of videos and turntables have over a thousand
+    "build_tracks": Need("scene", 400, 1.2, 0.1, image_s=0.2),
     "average_translations": Need("scene", 600, 1.6, image_s=1.2),
     "triangulate_tracks": Need("scene", 600, 1.6, image_s=0.25),
     "adjust_bundle": Need("scene", 800, 4.5, 0.01, image_s=2.4),

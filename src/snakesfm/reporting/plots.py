@@ -127,5 +127,6 @@ def _point_picture(pixels: Array, heights: Array, colors: Array, size: tuple[int
     for dx, dy in ((0, 0), (1, 0), (0, 1), (1, 1)):
         target = np.minimum(y + dy, 2 * height - 1), np.minimum(x + dx, 2 * width - 1)
         picture[target] = np.column_stack([colors[rows][:, ::-1], np.full(len(rows), 255, np.uint8)])
-    ok, data = cv2.imencode(".png", picture, [cv2.IMWRITE_PNG_COMPRESSION, 9])
+    # the highest level takes eight times as long for .6 % less
+    ok, data = cv2.imencode(".png", picture, [cv2.IMWRITE_PNG_COMPRESSION, 6])
     return base64.b64encode(data.tobytes()).decode("ascii") if ok else ""

@@ -1,6 +1,5 @@
 """RANSAC over pairs of observations, batched over tracks of one length."""
 
-from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -27,7 +26,7 @@ def triangulate_ransac_dlt(
     points = np.full((len(lengths), 3), np.nan)
     for length in np.unique(lengths[lengths >= 2]).tolist():
         tracks = np.nonzero(lengths == length)[0]
-        pairs = _pairs(length, limits)
+        pairs = hypotheses_of(length, limits)
         step = max(1, BATCH_VALUES // (len(pairs) * length * 3))
         for start in range(0, len(tracks), step):
             chunk = tracks[start : start + step]
@@ -36,12 +35,17 @@ def triangulate_ransac_dlt(
     return check_points(problem, points, limits)
 
 
-def _pairs(length: int, limits: TriangulationLimits) -> Array:
-    pairs = np.array(list(combinations(range(length), 2)))
-    if len(pairs) > limits.max_hypotheses:
+def hypotheses_of(length: int, limits: TriangulationLimits) -> Array:
+    """Pairs (H,2) of the observations of a track, in lexicographic order."""
+    total = length * (length - 1) // 2
+    rows = np.arange(total)
+    if total > limits.max_hypotheses:
         rng = np.random.default_rng((limits.seed, length))
-        pairs = pairs[np.sort(rng.choice(len(pairs), limits.max_hypotheses, replace=False))]
-    return pairs
+        rows = np.sort(rng.choice(total, limits.max_hypotheses, replace=False))
+    # the list of all pairs would grow with the square of the length, of each length that occurs
+    starts = np.r_[0, np.cumsum(np.arange(length - 1, 0, -1))]
+    first = np.searchsorted(starts, rows, side="right") - 1
+    return np.stack([first, rows - starts[first] + first + 1], axis=1)
 
 
 def _triangulate_batch(

@@ -1,11 +1,14 @@
 """Triangulation of a scene: skipped images, distortion, angles and colours."""
 
+from itertools import combinations
+
 import numpy as np
 import pytest
 
 from snakesfm.geometry.camera import Camera
 from snakesfm.synthetic.problems import make_problem
 from snakesfm.triangulation.interface import TriangulationLimits, max_angles
+from snakesfm.triangulation.ransac_dlt import hypotheses_of
 from snakesfm.triangulation.tracks import mean_colors, triangulate_tracks
 
 LIMITS = TriangulationLimits(4.0, 1.0)
@@ -65,3 +68,16 @@ def test_mean_colors():
     colors = np.array([[0, 10, 255], [2, 20, 255], [7, 7, 7]], dtype=np.uint8)
     np.testing.assert_array_equal(mean_colors(colors, np.array([0, 2, 3])), [[1, 15, 255], [7, 7, 7]])
     assert mean_colors(colors[:0], np.array([0])).shape == (0, 3)
+
+
+@pytest.mark.parametrize("length", [2, 3, 14, 15, 16, 100, 999])
+def test_hypotheses_are_all_pairs_or_as_many_of_them_as_wanted(length):
+    limits = TriangulationLimits(max_hypotheses=100)
+    pairs = hypotheses_of(length, limits)
+    everything = list(combinations(range(length), 2))
+    found = list(map(tuple, pairs.tolist()))
+    assert len(found) == min(100, len(everything))
+    assert found == sorted(set(found)) and set(found) <= set(everything)
+    if len(everything) > 100:
+        # from everywhere, not from the front
+        assert pairs.max() > 0.7 * length and 0.5 * length < pairs[:, 1].mean() < 0.85 * length
