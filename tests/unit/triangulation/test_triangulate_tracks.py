@@ -72,7 +72,7 @@ def test_mean_colors():
 
 @pytest.mark.parametrize("length", [2, 3, 14, 15, 16, 100, 999])
 def test_hypotheses_are_all_pairs_or_as_many_of_them_as_wanted(length):
-    limits = TriangulationLimits(max_hypotheses=100)
+    limits = TriangulationLimits(4.0, 1.0, max_hypotheses=100)
     pairs = hypotheses_of(length, limits)
     everything = list(combinations(range(length), 2))
     found = list(map(tuple, pairs.tolist()))
