@@ -32,7 +32,7 @@ class Run:
         self.lock: Any = None
         self.slurm_run = ""
 
-    def refuse_unrecorded(self, asked: Set[str], keeps_records: bool = True) -> None:
+    def refuse_unrecorded(self, asked: Set[str]) -> None:
         """Set aside what other images, options or seeds made and Snakemake knows nothing of.
 
         Before the jobs are planned, so that they are planned to be made again. What does not say of itself
@@ -41,7 +41,6 @@ class Run:
         Parameters
         ----------
         asked : the words of Snakemake's command line, targets among them.
-        keeps_records : whether Snakemake will know of what this run makes; else it would be made each time.
 
         Raises
         ------
@@ -49,7 +48,7 @@ class Run:
         """
         self._refuse_locked()
         for scene in self.plan.scenes.values():
-            for path in unrecorded_files(scene.results(asked) if keeps_records else ()):
+            for path in unrecorded_files(scene.results(asked)):
                 with contextlib.suppress(OSError):
                     forget(path)
             unknown = unrecorded_files(scene.artifacts())

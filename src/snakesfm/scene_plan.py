@@ -52,8 +52,8 @@ STAGES_IN_DETECTOR_PIXELS = (
 )
 IMAGE_LISTS = ("images.txt", "images.bin")
 """Beside known cameras: which image is of which."""
-PARTIAL = frozenset(("--until", "-U", "--omit-from", "-O"))
-"""Words of Snakemake's command line by which it does not make all of its targets."""
+PARTIAL = frozenset(("--until", "-U", "--omit-from", "-O", "--drop-metadata"))
+"""Words of Snakemake's command line by which it does not make all of its targets, or keeps no records."""
 STAGES_WITH_NETWORKS = ("extract_features", "describe_images", "match_pairs")
 
 

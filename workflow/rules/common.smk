@@ -34,7 +34,7 @@ try:
     PLAN = Plan(config, weights_only="fetch_weights" in asked)
     RUN = Run(PLAN)
     if workflow.is_main_process and not makes_nothing(sys.argv[1:]):
-        RUN.refuse_unrecorded(asked, workflow.execution_settings.keep_metadata)
+        RUN.refuse_unrecorded(asked)
 except SnakesfmError as error:
     raise refusal(error) from None
 

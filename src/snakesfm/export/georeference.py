@@ -94,7 +94,7 @@ def georeference(centers: Array, gps: Array, origin: Origin, seed: int) -> Geore
         )
         residuals = np.linalg.norm(found.transform_points(sources) - places, axis=1)
         inliers = residuals <= max_error
-        max_error = max(INLIER_SIGMAS * robust_sigma(residuals, 0.0), 1e-6)
+        max_error = min(max(INLIER_SIGMAS * robust_sigma(residuals, 0.0), 1e-6), COARSE_ERROR_M)
     if found is None or inliers.sum() < MINIMAL_SAMPLE:
         return None
     places = places[inliers]

@@ -45,6 +45,11 @@ UNDO_TURN = {
     7: Image.Transpose.TRANSVERSE,
     8: Image.Transpose.ROTATE_270,
 }
+# what stands for no value in pictures of floating-point numbers
+NO_VALUES = (-9999.0, -32767.0, -32768.0)
+# fewer of the 256 gray levels leave a picture without detail
+FEW_LEVELS = 32
+MANY_VALUES = 1_000_000
 # the bound above takes the place of PIL's, which refuses aerial photographs
 Image.MAX_IMAGE_PIXELS = None
 
@@ -281,12 +286,22 @@ def _from_rgb(rgb: Array, reduction: int = 1) -> ImagePixels:
 
 
 def _to_8_bit(values: Array) -> Array:
-    """Gray values (H,W) or colours (H,W,3) of any type to uint8."""
-    if values.dtype.kind == "f":
-        values = np.nan_to_num(values, nan=0.0, posinf=0.0, neginf=0.0)
-        low, high = float(values.min()), float(values.max())
-        scale = 255.0 / (high - low) if high > low else 0.0
-        return np.round((values - low) * scale).astype(np.uint8)
-    values = np.maximum(values, 0)
-    shift = max(int(values.max()).bit_length() - 8, 0)
-    return (values >> shift).astype(np.uint8)
+    """Gray values (H,W) or colours (H,W,3) of any type to uint8.
+
+    Of integers the upper bits in use, as of cameras of 10 to 16 bits. Numbers that would take few gray
+    levels so, as of thermal cameras or beside one hot pixel, and floating-point ones are stretched: nearly
+    all of them to all levels. What stands for no value counts as the darkest.
+    """
+    void = ~np.isfinite(values) | np.isin(values, NO_VALUES)
+    some = values[~void].ravel()
+    some = some[:: max(1, len(some) // MANY_VALUES)]
+    if not len(some):
+        return np.zeros(values.shape, np.uint8)
+    low, high = (float(value) for value in np.percentile(some, (0.1, 99.9)))
+    if values.dtype.kind != "f":
+        shift = max(int(values.max()).bit_length() - 8, 0)
+        if not shift or high == low or high - low >= FEW_LEVELS << shift:
+            return (np.maximum(values, 0) >> shift).astype(np.uint8)
+    scale = 255.0 / (high - low) if high > low else 0.0
+    stretched = np.where(void, 0.0, (np.where(void, low, values) - low) * scale)
+    return np.clip(np.round(stretched), 0, 255).astype(np.uint8)

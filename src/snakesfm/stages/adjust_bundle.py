@@ -102,7 +102,8 @@ def run(job: StageJob) -> None:
         raise SceneError(
             f"Scene '{job.scene}': bundle adjustment kept fewer than two images: the averaged poses do not "
             "fit the tracks; check the cameras' focal lengths, or lower adjust_bundle.min_observations. "
-            "Photographs that were all taken from one place, as for a panorama, show no depth."
+            "Photographs that were all taken from one place, as for a panorama, show no depth; an object "
+            "that turns before a fixed background needs masks=."
         )
     adjusted.sort(key=lambda found: -found[0].registered.sum())
     final = tuple(restore_cameras(cameras, originals, job.settings))

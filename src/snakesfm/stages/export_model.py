@@ -70,7 +70,17 @@ RESET_CAMERA = (
 # more of them tell no more of a lens
 OBSERVATIONS_OF_LENSES = 500_000
 
-NO_PLACE = "georeference is true, but fewer than four registered images tell their position in EXIF."
+NO_PLACE = (
+    "georeference is true, but fewer than four registered images tell their position in EXIF, or these "
+    "agree with no model."
+)
+
+UNTRUSTED_PLACE = (
+    "georeference is true, but the positions in EXIF do not tell where the model is: {inliers} of {images} "
+    "agree with it, or they lie on one line."
+)
+
+COPIES = "{count} images are copies of others, byte for byte, and were left out: the others stand for them."
 
 
 def run(job: StageJob) -> None:
@@ -100,6 +110,11 @@ def run(job: StageJob) -> None:
         warnings.append(REFUSED.format(count=len(index.refused_names), first=index.refused_reasons[0]))
     if job.options.georeference is True and place is None:
         warnings.append(NO_PLACE)
+    if place is not None and not place.trusted:
+        warnings.append(UNTRUSTED_PLACE.format(inliers=place.inliers, images=place.images))
+    copies = int(np.count_nonzero(index.duplicate_of >= 0))
+    if copies:
+        warnings.append(COPIES.format(count=copies))
     given_masks = Path(job.settings["masks"]) if "masks" in job.settings else None
     of_image = {names[row]: cameras[index.camera_ids[row]] for row in registered}
     masks = _masks(given_masks, of_image, warnings)

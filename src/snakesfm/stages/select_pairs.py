@@ -44,6 +44,9 @@ def run(job: StageJob) -> None:
     pairs_file = str(job.settings["pairs_file"])
     options: SelectPairsOptions = job.options
     table = _choose(job, index, options, pairs_file)
+    if options.method != "listed":
+        # the first of several images with the same bytes stands for all
+        table = table.take(np.flatnonzero((index.duplicate_of[table.pairs] < 0).all(axis=1)))
     proposed = len(table.pairs)
     likenesses = np.full(proposed, np.nan, np.float32)
     if options.preview_keypoints:

@@ -101,7 +101,7 @@ def test_16_bit_colour_and_12_bit_data(tmp_path, picture):
 @pytest.mark.parametrize("name", ["deep.png", "deep.tif"])
 def test_colours_of_12_bits_in_16_are_not_dark(tmp_path, picture, name):
     path = tmp_path / name
-    bright = np.maximum(picture, 200)
+    bright = 255 - picture // 2
     cv2.imwrite(str(path), cv2.cvtColor(bright.astype(np.uint16) << 4, cv2.COLOR_RGB2BGR))
     np.testing.assert_array_equal(read_image(path).rgb, bright)
 
@@ -138,14 +138,14 @@ def deep_tiff(path, colours, orientation, extra_samples=()):
 
 @pytest.mark.parametrize("value", range(1, 9))
 def test_orientation_of_deep_colours_is_not_applied(tmp_path, picture, value):
-    path = deep_tiff(tmp_path / "deep.tif", np.maximum(picture, 200).astype(np.uint16) << 8, value)
+    path = deep_tiff(tmp_path / "deep.tif", (255 - picture // 2).astype(np.uint16) << 8, value)
     assert read_header(path).exif.orientation == value
-    np.testing.assert_array_equal(read_image(path).rgb, np.maximum(picture, 200))
+    np.testing.assert_array_equal(read_image(path).rgb, (255 - picture // 2))
 
 
 @pytest.mark.parametrize("name", ["deep.png", "deep.tif"])
 def test_transparent_colours_of_12_bits_in_16_are_composed_over_black_and_not_dark(tmp_path, picture, name):
-    bright, alpha = np.maximum(picture, 200), np.zeros(picture.shape[:2], np.uint16)
+    bright, alpha = (255 - picture // 2), np.zeros(picture.shape[:2], np.uint16)
     alpha[:, :90], alpha[:, 90:140] = 0xFFFF, 0x7FFF
     colours = np.dstack([bright.astype(np.uint16) << 4, alpha])
     path = tmp_path / name
@@ -161,10 +161,10 @@ def test_transparent_colours_of_12_bits_in_16_are_composed_over_black_and_not_da
 
 def test_deep_colours_that_alpha_is_multiplied_into_stay_as_they_are(tmp_path, picture):
     colours = np.dstack(
-        [np.maximum(picture, 200).astype(np.uint16) << 4, picture[..., 0].astype(np.uint16) << 8]
+        [(255 - picture // 2).astype(np.uint16) << 4, picture[..., 0].astype(np.uint16) << 8]
     )
     path = deep_tiff(tmp_path / "deep.tif", colours, 1, extra_samples=(1,))
-    np.testing.assert_array_equal(read_image(path).rgb, np.maximum(picture, 200))
+    np.testing.assert_array_equal(read_image(path).rgb, (255 - picture // 2))
 
 
 def test_one_bit_and_transparent_pixels(tmp_path, picture):
@@ -275,3 +275,45 @@ def test_other_content_than_the_suffix_says(tmp_path, picture):
     path = save(picture, tmp_path / "a.png")
     path = path.rename(tmp_path / "a.jpg")
     np.testing.assert_array_equal(read_image(path).rgb, picture)
+
+
+def textured(seed=0):
+    """Gray values (300,400) of 0 to 1 with detail at all scales."""
+    rng = np.random.default_rng(seed)
+    layers = [cv2.resize(rng.random((3 * k, 4 * k)), (400, 300)) for k in (2, 10, 50)]
+    values = sum(layers)
+    return (values - values.min()) / np.ptp(values)
+
+
+def spoilt(values, pixels, value):
+    values = values.copy()
+    values.ravel()[:pixels] = value
+    return values
+
+
+@pytest.mark.parametrize(
+    ("name", "values"),
+    [
+        ("hot.png", spoilt((textured() * 4095).astype(np.uint16), 1, 65535)),
+        ("thermal.tif", (29000 + textured() * 2040).astype(np.uint16)),
+        ("unit.tif", textured().astype(np.float32)),
+        ("hot.tif", spoilt(textured().astype(np.float32), 1, 50.0)),
+        ("nodata.tif", spoilt(textured().astype(np.float32), 1200, -9999.0)),
+        ("nan.tif", spoilt(textured().astype(np.float32), 1200, np.nan)),
+    ],
+)
+def test_numbers_of_narrow_range_or_beside_a_stray_one_keep_their_detail(tmp_path, name, values):
+    cv2.imwrite(str(tmp_path / name), values)
+    gray = read_image(tmp_path / name).gray
+    inside = gray.ravel()[1200:]
+    expected = np.round(textured().ravel()[1200:] * 255)
+    assert len(np.unique(inside)) > 200
+    assert np.corrcoef(inside, expected)[0, 1] > 0.99
+    assert np.abs(np.median(inside) - np.median(expected)) < 25
+
+
+@pytest.mark.parametrize("bits", [10, 12, 16])
+def test_numbers_that_use_their_bits_are_shifted_as_before(tmp_path, bits):
+    values = (textured() * (2**bits - 1)).astype(np.uint16)
+    cv2.imwrite(str(tmp_path / "deep.png"), values)
+    np.testing.assert_array_equal(read_image(tmp_path / "deep.png").gray, values >> (bits - 8))
