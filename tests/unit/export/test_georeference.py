@@ -94,3 +94,11 @@ def test_the_origin_is_the_middle_and_the_result_is_that_of_the_seed():
     first, second = (georeference(centers, gps, ORIGIN, 7).local_from_model for _ in range(2))
     np.testing.assert_array_equal(first.rotation, second.rotation)
     assert first.scale == second.scale
+
+
+def test_positions_that_agree_with_nothing_are_no_inliers():
+    centers, gps, _ = survey(count=12)
+    gps[6:] += [-30.0, 60.0, 0.0]
+    found = georeference(centers, gps, ORIGIN, 0)
+    # six of them agree with each other, all twelve with nothing
+    assert found is None or (found.inliers <= 6 and found.median_residual_m < 20.0)

@@ -66,7 +66,7 @@ def images(tmp_path_factory):
 class Scene:
     """The stages from index to matches, in one folder, with a number of blocks."""
 
-    def __init__(self, folder, images, blocks, shas=None, gps=None):
+    def __init__(self, folder, images, blocks, shas=None, gps=None, copies=()):
         self.folder, self.images, self.blocks = folder, images, blocks
         count = len(NAMES)
         index = ImageIndex(
@@ -78,7 +78,7 @@ class Scene:
             orientations=np.ones(count, int),
             focal_exif_px=np.full(count, np.nan),
             gps=np.full((count, 3), np.nan) if gps is None else gps,
-            duplicate_of=np.full(count, -1),
+            duplicate_of=[0 if row in copies else -1 for row in range(count)],
             camera_models=["PINHOLE"],
             camera_sizes=[[320, 240]],
             camera_params=np.full((1, PARAM_SLOTS), np.nan),
@@ -279,6 +279,17 @@ def test_pairs_are_looked_at_and_what_shares_nothing_is_left(dealt, whole):
     kept = {pair for pair, *_ in dealt.select(fewest) if not {2, 3} & {*pair}}
     # each of four images keeps one
     assert 2 <= len(kept) <= 4 and max(overlapping, key=likenesses.get) in kept
+
+
+def test_copies_of_an_image_are_left_out_but_where_a_list_names_them(images, tmp_path):
+    scene = Scene(tmp_path / "copies", images, 2, copies=(1, 5))
+    scene.extract()
+    options = SelectPairsOptions(preview_keypoints=0, method="exhaustive")
+    pairs = {pair for pair, *_ in scene.select(options)}
+    assert pairs == {(i, j) for i in range(6) for j in range(i + 1, 6) if not {1, 5} & {i, j}}
+    path = tmp_path / "pairs.txt"
+    path.write_text(f"{NAMES[0]} {NAMES[1]}\n", "utf-8")
+    assert [pair for pair, *_ in scene.select(SelectPairsOptions(method="listed"), str(path))] == [(0, 1)]
 
 
 def test_a_list_is_followed(dealt, tmp_path):
