@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from snakesfm.export.observations import with_observations
 from snakesfm.geometry.camera import Camera
 from snakesfm.geometry.colmap_binding import pycolmap
 from snakesfm.geometry.poses import to_rigid3d
@@ -45,32 +46,22 @@ def build_reconstruction(
     rotations, translations : (N,3,3), (N,3) cam_from_world; NaN where not registered.
     points, colors, errors_px : (T,3) float64, (T,3) uint8 RGB, (T,) mean reprojection error in pixels.
     offsets, image_ids, keypoints : (T+1,), (L,), (L,2): observations of the points, in original pixels.
+
+    Raises
+    ------
+    ValueError : a point is observed by an image that is not registered.
+    ConfigError : the installed pycolmap has binary files of another layout.
     """
     registered = registered_images(rotations, translations)
+    if not np.isin(image_ids, registered).all():
+        raise ValueError("points are observed by images without a pose")
     model = pycolmap.Reconstruction()
     for row in sorted({int(camera_ids[image]) for image in registered}):
         model.add_camera_with_trivial_rig(cameras[row].to_pycolmap(row + 1))
-    order = np.argsort(image_ids, kind="stable")
-    counts = np.bincount(image_ids, minlength=len(names))
-    starts = np.concatenate([[0], np.cumsum(counts)])
-    point2d_ids = np.empty(len(image_ids), dtype=np.int64)
-    point2d_ids[order] = np.arange(len(image_ids)) - np.repeat(starts[:-1], counts)
-    pixels = np.asarray(keypoints, dtype=np.float64)
     for row in registered.tolist():
-        image = pycolmap.Image(
-            name=names[row],
-            keypoints=pixels[order[starts[row] : starts[row + 1]]].reshape(-1, 2),
-            camera_id=int(camera_ids[row]) + 1,
-            image_id=row + 1,
-        )
+        image = pycolmap.Image(name=names[row], camera_id=int(camera_ids[row]) + 1, image_id=row + 1)
         model.add_image_with_trivial_frame(image, to_rigid3d(rotations[row], translations[row]))
-    colmap_ids = (image_ids + 1).tolist()
-    elements = list(map(pycolmap.TrackElement, colmap_ids, point2d_ids.tolist()))
-    for row in range(len(points)):
-        track = pycolmap.Track(elements=elements[offsets[row] : offsets[row + 1]])
-        point = pycolmap.Point3D(xyz=points[row], color=colors[row], error=errors_px[row], track=track)
-        model.add_point3D_with_id(row + 1, point)
-    return model
+    return with_observations(model, points, colors, errors_px, offsets, image_ids, keypoints)
 
 
 def other_model_sizes(models: Array) -> list[int]:
