@@ -44,6 +44,7 @@ def write_scene(made, folder):
         camera_sources=sources,
         refused_names=[],
         refused_reasons=[],
+        warnings=[],
     ).write(folder / "index.h5", HEADER)
     CalibratedCameras(
         models, sizes, params, sources, np.full(len(models), np.nan), np.zeros(len(models), int)

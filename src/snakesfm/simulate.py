@@ -136,6 +136,7 @@ class Simulation:
             camera_sources=np.array(sources, dtype=object),
             refused_names=np.zeros(0, dtype=object),
             refused_reasons=np.zeros(0, dtype=object),
+            warnings=np.zeros(0, dtype=object),
         ).write(self._path("index_images", "index"), self._header("index_images"))
 
     def write_features(self, block: int) -> None:

@@ -11,7 +11,7 @@ class ImageIndex(Artifact):
     """The images of a scene, in the order of their names, and the cameras that took them."""
 
     kind: ClassVar[str] = "image_index"
-    format_version: ClassVar[int] = 2
+    format_version: ClassVar[int] = 3
 
     names: Array = column("(N)", "str", "POSIX path relative to the image folder, sorted")
     sizes: Array = column("(N,2)", "int32", "width and height in pixels as stored in the file")
@@ -30,6 +30,7 @@ class ImageIndex(Artifact):
     camera_sources: Array = column("(C)", "str", "where the focal length is from: given, exif, default")
     refused_names: Array = column("(R)", "str", "files that look like images but cannot be used")
     refused_reasons: Array = column("(R)", "str", "one sentence per refused file")
+    warnings: Array = column("(W)", "str", "one sentence for all else that is doubtful")
 
 
 @dataclass(frozen=True)

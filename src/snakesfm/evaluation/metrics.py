@@ -1,9 +1,7 @@
 """The metrics of a model: against reference poses, and those that need no truth."""
 
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from pathlib import PurePosixPath
 from typing import Any
 
 import numpy as np
@@ -19,6 +17,7 @@ from snakesfm.evaluation.pose_errors import (
 )
 from snakesfm.geometry.poses import center_of
 from snakesfm.geometry.rotations import angle_between
+from snakesfm.image_names import match_names
 
 Array = NDArray[Any]
 Metrics = dict[str, float | int | None]
@@ -69,28 +68,6 @@ class PoseEvaluation:
             name: {key: None if values[k] != values[k] else values[k] for key, values in columns.items()}
             for k, name in enumerate(self.names)
         }
-
-
-def match_names(names: Sequence[str], reference_names: Sequence[str]) -> Array:
-    """For each reference image the row of the same image in ``names``, -1 where there is none.
-
-    Relative paths decide; where a path is in no other list, the file name alone does if it is unique
-    in both, else without its suffix, as of images that were converted.
-    """
-    rows = {name: row for row, name in enumerate(names)}
-    matched = np.array([rows.get(name, -1) for name in reference_names], dtype=np.int64)
-    for part in ("name", "stem"):
-        taken = set(matched.tolist())
-        by_part: dict[str, list[int]] = {}
-        for row, name in enumerate(names):
-            by_part.setdefault(getattr(PurePosixPath(name), part), []).append(row)
-        reference_parts = [getattr(PurePosixPath(name), part) for name in reference_names]
-        counts = Counter(reference_parts)
-        for row in np.flatnonzero(matched < 0).tolist():
-            candidates = by_part.get(reference_parts[row], [])
-            if len(candidates) == 1 and counts[reference_parts[row]] == 1 and candidates[0] not in taken:
-                matched[row] = candidates[0]
-    return matched
 
 
 def evaluate_poses(

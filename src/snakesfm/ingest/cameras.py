@@ -1,5 +1,7 @@
 """Which images were taken by one camera, and what its intrinsics are before anything is measured."""
 
+import re
+from bisect import bisect_left, bisect_right
 from collections import Counter, defaultdict
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
@@ -15,6 +17,7 @@ from snakesfm.ingest.exif import Exif, focal_from_exif, is_cropped, is_of_stated
 
 Array = NDArray[Any]
 Sharing = Literal["auto", "exif", "single", "per_folder", "per_image"]
+Series = tuple[str, str, str, str]
 
 # so many camera models never agree on one image size by themselves: someone cropped to it
 MODELS_OF_ONE_SIZE = 5
@@ -22,6 +25,11 @@ MODELS_OF_ONE_SIZE = 5
 IMAGES_PER_SIZE = 20
 # or those of one size where they are so many of a folder's images, beside a few strays
 SHARE_OF_ONE_SIZE = 0.75
+# a folder of fewer images without EXIF may hold several such sizes, none of them a stray's
+IMAGES_PER_SMALL_SIZE = 3
+# numbers of frames of a video differ by less on average, those that a web site gives photographs by more
+LARGEST_STEP = 1000
+NUMBERED = re.compile(r"(.*?)([0-9]+)([^0-9]*)")
 # 'auto' begins with it; adjust_bundle takes a wider model where a lens needs one
 FIRST_MODEL = "SIMPLE_RADIAL"
 
@@ -49,6 +57,32 @@ class Photograph:
     def body(self) -> tuple[str, str] | None:
         """Make and model of the camera, or None where EXIF names no model."""
         return (self.exif.make, self.exif.model) if self.exif.model else None
+
+    @property
+    def optics(self) -> tuple[str | float, ...] | None:
+        """Make, model, lens and focal lengths in mm, 0 where unknown; None where EXIF names no model."""
+        if not self.exif.model:
+            return None
+        # NaN is not equal to itself
+        focal = [round(mm, 3) if mm > 0 else 0.0 for mm in (self.exif.focal_mm, self.exif.focal_35mm)]
+        return (self.exif.make, self.exif.model, self.exif.lens, *focal)
+
+    @property
+    def series(self) -> Series:
+        """Folder, suffix, and what stands before and after the last number of the name."""
+        before, _, after = self._parts
+        return self.folder, PurePosixPath(self.name).suffix, before, after
+
+    @property
+    def number(self) -> int:
+        """The last number of the name, -1 where it has none."""
+        return int(self._parts[1] or -1)
+
+    @property
+    def _parts(self) -> tuple[str, str, str]:
+        stem = PurePosixPath(self.name).stem
+        found = NUMBERED.fullmatch(stem)
+        return (found[1], found[2], found[3]) if found else (stem, "", "")
 
 
 @dataclass(frozen=True)
@@ -147,7 +181,8 @@ def group_images(photographs: Sequence[Photograph], sharing: Sharing) -> list[Ha
     sharing : ``single``, ``per_folder`` and ``per_image`` as they say. ``exif``: by camera, lens and focal
         length; images without EXIF each have their own. ``auto``: as ``exif``, but cropped images have
         their own, unless EXIF states their very size, as of sensors of 5:4. Images without EXIF share per
-        folder where their sizes agree as one camera's do, a few strays apart.
+        folder where their sizes agree as one camera's do, a few strays apart, or where those of one size
+        are a numbered series.
     """
     if sharing == "single":
         return [(p.width, p.height) for p in photographs]
@@ -158,6 +193,7 @@ def group_images(photographs: Sequence[Photograph], sharing: Sharing) -> list[Ha
     if sharing == "exif":
         return [_exif_key(p) if p.body else p.name for p in photographs]
     shared, of_one_size = _shared_sizes(photographs), _folders_of_one_size(photographs)
+    series = _numbered_series(photographs)
     keys: list[Hashable] = []
     for photograph in photographs:
         if photograph.body:
@@ -166,16 +202,15 @@ def group_images(photographs: Sequence[Photograph], sharing: Sharing) -> list[Ha
             keys.append(photograph.name if own else _exif_key(photograph))
         elif (photograph.folder, photograph.sides) in shared:
             keys.append((photograph.folder, photograph.width, photograph.height))
+        elif (photograph.series, photograph.sides) in series:
+            keys.append((photograph.series, photograph.width, photograph.height))
         else:
             keys.append(photograph.name)
     return keys
 
 
 def _exif_key(photograph: Photograph) -> Hashable:
-    exif = photograph.exif
-    # NaN is not equal to itself
-    focal = [round(value, 3) if value > 0 else 0.0 for value in (exif.focal_mm, exif.focal_35mm)]
-    return ("exif", exif.make, exif.model, exif.lens, photograph.width, photograph.height, *focal)
+    return ("exif", photograph.optics, photograph.width, photograph.height)
 
 
 def _shared_sizes(photographs: Sequence[Photograph]) -> set[tuple[str, tuple[int, int]]]:
@@ -199,6 +234,67 @@ def _shared_sizes(photographs: Sequence[Photograph]) -> set[tuple[str, tuple[int
         most = SHARE_OF_ONE_SIZE * images[folder]
         shared |= {(folder, sides) for sides, count in sizes.items() if few or count >= most}
     return shared
+
+
+def _numbered_series(photographs: Sequence[Photograph]) -> set[tuple[Series, tuple[int, int]]]:
+    """Series and sides of images without EXIF that look like those of one camera, whatever lies beside.
+
+    There are many of them, or the folder holds nothing but a few such series; their numbers are close, and
+    next to no other image stands between them, as it does in numbered crowd photographs.
+    """
+    numbers: dict[Series, list[int]] = defaultdict(list)
+    found: dict[tuple[Series, tuple[int, int]], list[int]] = defaultdict(list)
+    sizes: dict[str, Counter[tuple[int, int]]] = defaultdict(Counter)
+    parts: dict[tuple[str, tuple[int, int]], set[Series]] = defaultdict(set)
+    for photograph in photographs:
+        series, sides, folder = photograph.series, photograph.sides, photograph.folder
+        numbers[series].append(photograph.number)
+        sizes[folder][sides] += 1
+        if not photograph.body:
+            parts[folder, sides].add(series)
+            if photograph.number >= 0:
+                found[series, sides].append(photograph.number)
+    for of_series in numbers.values():
+        of_series.sort()
+    alike: set[tuple[Series, tuple[int, int]]] = set()
+    for (series, sides), own in found.items():
+        low, high = min(own), max(own)
+        between = bisect_right(numbers[series], high) - bisect_left(numbers[series], low)
+        if high - low <= LARGEST_STEP * len(own) and len(own) >= SHARE_OF_ONE_SIZE * between:
+            alike.add((series, sides))
+    scattered = {
+        folder
+        for (folder, sides), of_size in parts.items()
+        if len(of_size) > 1 or (next(iter(of_size)), sides) not in alike
+    }
+    scattered |= {folder for folder, of in sizes.items() if min(of.values()) < IMAGES_PER_SMALL_SIZE}
+    return {
+        (series, sides)
+        for series, sides in alike
+        if len(found[series, sides]) >= IMAGES_PER_SIZE or series[0] not in scattered
+    }
+
+
+def warn_of_own_cameras(
+    photographs: Sequence[Photograph], found: ImageCameras, sharing: Sharing
+) -> list[str]:
+    """A sentence where most images were given a camera each though they have few sizes, else none."""
+    counts = np.bincount(found.camera_ids, minlength=len(found.cameras))
+    own = [
+        photograph
+        for photograph, row in zip(photographs, found.camera_ids.tolist(), strict=True)
+        if counts[row] == 1 and found.cameras[row].source != "given"
+    ]
+    models = {photograph.body for photograph in own if photograph.body}
+    sizes = {photograph.sides for photograph in own}
+    chosen = sharing in ("single", "per_folder", "per_image")
+    most_of_few_sizes = len(own) > max(len(photographs) / 2, 2 * len(sizes))
+    if chosen or len(models) >= MODELS_OF_ONE_SIZE or not most_of_few_sizes:
+        return []
+    return [
+        f"{len(own)} images have a camera each: if one camera took them, and none was cropped by "
+        "itself, say index_images={camera_sharing: single}."
+    ]
 
 
 def _initial_focal(stated: Array, cropped: Array, default: float) -> tuple[float, str]:

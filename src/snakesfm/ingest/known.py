@@ -1,6 +1,7 @@
 """Known intrinsics: COLMAP's cameras files and 3x3 matrices, and which image they belong to."""
 
 import struct
+from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import zip_longest
@@ -11,11 +12,19 @@ import numpy as np
 from snakesfm.errors import ConfigError
 from snakesfm.geometry.camera import Camera
 from snakesfm.geometry.colmap_binding import pycolmap
+from snakesfm.image_names import match_names
+from snakesfm.ingest.cameras import Photograph
 
 FILE_NAMES = ("cameras.bin", "cameras.txt", "K.txt")
 # images.bin: quaternion and translation between image id and camera id
 POSE_BYTES = 56
 POINT_BYTES = 24
+# cropping a third away on one side moves the principal point a quarter of what remains from the centre
+MAX_OFF_CENTRE = 0.5
+# off alike in both directions: scaling does that, and hardly ever a lens or a crop
+MAX_SCALING = 0.2
+SAME_ASPECT = 0.03
+LIMIT = "; an images.txt beside a cameras.txt limits a camera to the images that it lists"
 
 
 @dataclass(frozen=True)
@@ -32,6 +41,11 @@ class KnownCameras:
     path: Path
     cameras: dict[int, Camera]
     camera_of: dict[str, int]
+
+    @property
+    def listing(self) -> Path:
+        """The list of images beside the file, whether it is there or not."""
+        return self.path.with_name("images" + self.path.suffix)
 
 
 def read_known_cameras(path: Path | str) -> KnownCameras:
@@ -70,45 +84,98 @@ def read_known_cameras(path: Path | str) -> KnownCameras:
 
 
 def match_known_cameras(
-    known: KnownCameras, names: Sequence[str], sizes: Sequence[tuple[int, int]]
-) -> list[Camera | None]:
-    """The known camera of each image, scaled to the image's size; None where there is none.
+    known: KnownCameras, photographs: Sequence[Photograph]
+) -> tuple[list[Camera | None], list[str]]:
+    """The known camera of each image, scaled to the image's size, None where there is none; and warnings.
 
-    An image that the list names has the camera named there. Without a list, one camera is that of all
-    images, and of several the one of the image's size. An image that a list lacks has the one camera of its
-    size, if any.
+    Without a list, one camera is that of all images, and of several the one of the image's size. An image
+    that the list names, by its path or else by a file name of its own, has the camera named there. An image
+    that the list lacks has the one camera of its size, if any, where EXIF names the same body, lens and
+    focal length as of that camera's images, or names none of either.
 
     Raises
     ------
     ConfigError : an image's camera is of another shape than the image, or cannot be told.
     """
+    if known.camera_of:
+        return _match_list(known, photographs)
     if any(camera.width == 0 for camera in known.cameras.values()):
-        return list(_match_matrix(known, names, sizes))
-    listed = [known.camera_of.get(name) for name in names]
-    if known.camera_of and any(camera_id is not None for camera_id in listed):
-        fallback: Camera | None = None
-        strict = False
+        found = list(_match_matrix(known, photographs))
     else:
-        fallback = next(iter(known.cameras.values())) if len(known.cameras) == 1 else None
-        strict = True
+        found = [_match_size(known, photograph) for photograph in photographs]
+    # one camera is scaled to images of several sizes
+    models_of: dict[Camera | None, set[str]] = defaultdict(set)
+    for photograph, camera in zip(photographs, found, strict=True):
+        if photograph.body:
+            models_of[camera if len(known.cameras) > 1 else None].add(photograph.body[1])
+    return list(found), [
+        f"{known.path} gives one camera to images of {len(models)} camera models in EXIF "
+        f"({', '.join(sorted(models)[:3])}): list its images in an images.txt beside a cameras.txt."
+        for models in models_of.values()
+        if len(models) > 1
+    ]
+
+
+def _match_list(
+    known: KnownCameras, photographs: Sequence[Photograph]
+) -> tuple[list[Camera | None], list[str]]:
+    """As :func:`match_known_cameras`, by a list of images."""
+    listed = _listed_cameras(known, [photograph.name for photograph in photographs])
+    optics_of = defaultdict(set)
+    for photograph, camera_id in zip(photographs, listed, strict=True):
+        optics_of[camera_id].add(photograph.optics)
     found: list[Camera | None] = []
-    for name, (width, height), camera_id in zip(names, sizes, listed, strict=True):
+    by_size: Counter[int] = Counter()
+    for photograph, camera_id in zip(photographs, listed, strict=True):
         if camera_id is not None:
-            found.append(_fit(known.path, known.cameras[camera_id], name, width, height))
+            found.append(_fit(known.path, known.cameras[camera_id], photograph))
             continue
-        same = [c for c in known.cameras.values() if (c.width, c.height) == (width, height)]
-        if fallback is not None:
-            found.append(_fit(known.path, fallback, name, width, height))
-        elif len(same) == 1:
-            found.append(same[0])
-        elif strict:
-            raise ConfigError(
-                f"{known.path} holds {len(known.cameras)} cameras, of which {len(same)} have the size "
-                f"{width} x {height} of {name}: put the images.txt beside it that says whose is which."
-            )
+        same = _cameras_of_size(known, photograph)
+        if len(same) == 1 and photograph.optics in optics_of.get(same[0], {None}):
+            found.append(known.cameras[same[0]])
+            by_size[same[0]] += photograph.optics is None
         else:
             found.append(None)
-    return found
+    return found, [
+        f"{count} images that {known.listing} lacks took camera {camera_id} by their size: list them there "
+        "with the camera that took them."
+        for camera_id, count in by_size.items()
+        if count
+    ]
+
+
+def _listed_cameras(known: KnownCameras, names: Sequence[str]) -> list[int | None]:
+    """The camera that the list names for each image, None where it lacks the image."""
+    found = [known.camera_of.get(name) for name in names]
+    if not names or any(camera_id is not None for camera_id in found):
+        return found
+    others = list(known.camera_of)
+    rows = match_names(others, names)
+    if (rows < 0).all():
+        raise ConfigError(
+            f"{known.listing} names none of the images (it has '{others[0]}', the folder '{names[0]}'): "
+            "correct its names or move it away."
+        )
+    return [known.camera_of[others[row]] if row >= 0 else None for row in rows.tolist()]
+
+
+def _cameras_of_size(known: KnownCameras, photograph: Photograph) -> list[int]:
+    size = (photograph.width, photograph.height)
+    return [key for key, camera in known.cameras.items() if (camera.width, camera.height) == size]
+
+
+def _match_size(known: KnownCameras, photograph: Photograph) -> Camera:
+    """The only camera there is, or the one of the image's size."""
+    if len(known.cameras) == 1:
+        return _fit(known.path, next(iter(known.cameras.values())), photograph, LIMIT)
+    same = _cameras_of_size(known, photograph)
+    if len(same) != 1:
+        raise ConfigError(
+            f"{known.path} holds {len(known.cameras)} cameras, of which {len(same)} have the size "
+            f"{photograph.width} x {photograph.height} of {photograph.name}: put the images.txt beside it "
+            "that says whose is which."
+        )
+    return known.cameras[same[0]]
 
 
 def _find_file(path: Path) -> Path:
@@ -180,7 +247,7 @@ def _check(path: Path, camera_id: int, camera: Camera) -> None:
 
 def _image_cameras(path: Path) -> dict[str, int]:
     """Camera id by image name from the list of images beside a COLMAP cameras file."""
-    listing = path.with_name("images" + path.suffix)
+    listing = KnownCameras(path, {}, {}).listing
     if not listing.is_file():
         return {}
     try:
@@ -222,36 +289,39 @@ def _binary_image_cameras(data: bytes) -> Iterator[tuple[str, int]]:
         yield name, camera_id
 
 
-def _match_matrix(
-    known: KnownCameras, names: Sequence[str], sizes: Sequence[tuple[int, int]]
-) -> Iterator[Camera]:
-    if not names:
+def _match_matrix(known: KnownCameras, photographs: Sequence[Photograph]) -> Iterator[Camera]:
+    if not photographs:
         return
     (camera,) = known.cameras.values()
     _, _, cx, cy = camera.params
+    sizes = {(photograph.width, photograph.height) for photograph in photographs}
     # the matrix belongs to the size whose centre is nearest to its principal point
-    width, height = min(sorted(set(sizes)), key=lambda size: abs(2 * cx - size[0]) + abs(2 * cy - size[1]))
-    if not (0 < cx < width and 0 < cy < height):
+    width, height = min(sorted(sizes), key=lambda size: abs(2 * cx - size[0]) + abs(2 * cy - size[1]))
+    across, down = 2 * cx / width, 2 * cy / height
+    scaled = abs(across / down - 1) <= SAME_ASPECT and abs(across - 1) > MAX_SCALING
+    if scaled or max(abs(across - 1), abs(down - 1)) > MAX_OFF_CENTRE:
         raise ConfigError(
-            f"The principal point ({cx:g}, {cy:g}) of {known.path} lies outside the images of "
-            f"{width} x {height} pixels: give the matrix for the size of the images."
+            f"The principal point ({cx:g}, {cy:g}) of {known.path} is that of images of about "
+            f"{2 * cx:.0f} x {2 * cy:.0f} pixels, but the images have {width} x {height}: give the matrix "
+            "for the size of the images, or, if they were cropped, a cameras.txt that states it."
         )
     sized = replace(camera, width=width, height=height)
-    for name, size in zip(names, sizes, strict=True):
-        yield _fit(known.path, sized, name, *size)
+    for photograph in photographs:
+        yield _fit(known.path, sized, photograph, LIMIT)
 
 
-def _fit(path: Path, camera: Camera, name: str, width: int, height: int) -> Camera:
+def _fit(path: Path, camera: Camera, photograph: Photograph, hint: str = "") -> Camera:
     """The camera for an image of the same shape."""
+    width, height = photograph.width, photograph.height
     if (camera.width, camera.height) == (width, height):
         return camera
     across, down = width / camera.width, height / camera.height
     # a scaled image's sides are rounded to pixels
     if abs(across * camera.height - height) > 1 and abs(down * camera.width - width) > 1:
-        turned = (camera.height, camera.width) == (width, height)
-        hint = "; images are used as stored, without their EXIF rotation" if turned else ""
+        if (camera.height, camera.width) == (width, height):
+            hint = "; images are used as stored, without their EXIF rotation" + hint
         raise ConfigError(
-            f"{name} has {width} x {height} pixels, which is no scaling of the {camera.width} x "
+            f"{photograph.name} has {width} x {height} pixels, which is no scaling of the {camera.width} x "
             f"{camera.height} of its camera in {path}: correct that file or the image{hint}."
         )
     scaled = camera.to_pycolmap()

@@ -108,6 +108,7 @@ def run(job: StageJob) -> None:
         warnings.append(OTHER_MODELS.format(images=sum(others), count=len(others)))
     if len(index.refused_names):
         warnings.append(REFUSED.format(count=len(index.refused_names), first=index.refused_reasons[0]))
+    warnings += [str(line) for line in index.warnings]
     if job.options.georeference is True and place is None:
         warnings.append(NO_PLACE)
     if place is not None and not place.trusted:

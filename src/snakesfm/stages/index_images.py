@@ -13,7 +13,7 @@ from snakesfm.artifacts.images import ImageIndex
 from snakesfm.blocks import deal_blocks
 from snakesfm.errors import ImageError, SceneError
 from snakesfm.geometry.camera import cameras_to_columns
-from snakesfm.ingest.cameras import ImageCameras, Photograph, assign_cameras
+from snakesfm.ingest.cameras import ImageCameras, Photograph, assign_cameras, warn_of_own_cameras
 from snakesfm.ingest.discover import digest_images, fingerprint, list_photographs
 from snakesfm.ingest.known import match_known_cameras, read_known_cameras
 from snakesfm.ingest.read import read_header
@@ -44,18 +44,17 @@ def run(job: StageJob) -> None:
     photographs, refused = _read_headers(job, folder, names)
     refused |= {name: UNREAD.format(path=folder / name) for name in unread}
     _check_scene(folder, names, {digests[p.name] for p in photographs}, refused)
-    sizes = [(p.width, p.height) for p in photographs]
+    given, warnings = match_known_cameras(known, photographs) if known else ([None] * len(photographs), [])
     found = assign_cameras(
         photographs,
-        match_known_cameras(known, [p.name for p in photographs], sizes)
-        if known
-        else [None] * len(photographs),
+        given,
         sharing=options.camera_sharing,
         model=options.camera_model,
         default_focal_ratio=options.default_focal_ratio,
         use_exif=options.use_exif_focal,
     )
-    index = _to_index(photographs, [digests[p.name] for p in photographs], found, refused, job)
+    warnings += warn_of_own_cameras(photographs, found, options.camera_sharing)
+    index = _to_index(photographs, [digests[p.name] for p in photographs], found, refused, warnings, job)
     # jobs are not told the content, for only the controller compares it
     told = {**job.settings, "content": fingerprint(digests)}
     index.write(job.output, replace(job, settings=told).header)
@@ -105,6 +104,7 @@ def _to_index(
     digests: list[str],
     found: ImageCameras,
     refused: dict[str, str],
+    warnings: list[str],
     job: StageJob,
 ) -> ImageIndex:
     first_with: dict[str, int] = {}
@@ -128,12 +128,14 @@ def _to_index(
         camera_sources=np.array(sources, dtype=object),
         refused_names=np.array(list(refused), dtype=object),
         refused_reasons=np.array(list(refused.values()), dtype=object),
+        warnings=np.array(warnings, dtype=object),
     )
 
 
 def _report(index: ImageIndex) -> None:
     copies = [row for row, original in enumerate(index.duplicate_of) if original >= 0]
     _warn(index.refused_reasons)
+    _warn(index.warnings)
     _warn(f"{index.names[row]} is a copy of {index.names[index.duplicate_of[row]]}." for row in copies)
     sources = ", ".join(
         f"{count} {source}" for source, count in sorted(Counter(index.camera_sources).items())

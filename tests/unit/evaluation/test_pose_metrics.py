@@ -10,7 +10,7 @@ from snakesfm.errors import ConfigError
 from snakesfm.evaluation.__main__ import main
 from snakesfm.evaluation.alignment import align_poses
 from snakesfm.evaluation.colmap_model import find_model, model_poses, read_model
-from snakesfm.evaluation.metrics import Poses, evaluate_poses, match_names, model_metrics
+from snakesfm.evaluation.metrics import Poses, evaluate_poses, model_metrics
 from snakesfm.evaluation.pose_errors import (
     chordal_angle_deg,
     compared_images,
@@ -19,6 +19,7 @@ from snakesfm.evaluation.pose_errors import (
 )
 from snakesfm.geometry.poses import center_of, translation_of
 from snakesfm.geometry.rotations import angle_of, exp_so3
+from snakesfm.image_names import match_names
 from snakesfm.synthetic.problems import make_problem
 
 

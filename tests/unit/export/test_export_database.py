@@ -62,6 +62,7 @@ def write_inputs(folder: Path, problem: SyntheticProblem) -> dict[str, str | lis
         camera_sources=sources,
         refused_names=[],
         refused_reasons=[],
+        warnings=[],
     ).write(folder / "index.h5", HEADER)
     CalibratedCameras(models, sizes, params, sources, np.zeros(2), np.zeros(2, np.int32)).write(
         folder / "cameras.h5", HEADER

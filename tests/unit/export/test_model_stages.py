@@ -83,6 +83,7 @@ def write_index(
         camera_sources=sources,
         refused_names=["no <image>.jpg"],
         refused_reasons=["It is a text file."],
+        warnings=["5 images have a camera each."],
     ).write(folder / "index.h5", HEADER)
     return folder / "index.h5"
 
@@ -229,7 +230,8 @@ def test_summary_says_what_is_there_and_what_is_missing(tmp_path, problem) -> No
     assert summary["points"] == len(problem.points)
     assert 0.1 < summary["mean_reprojection_error_px"] < 0.5
     assert summary["mean_track_length"] == pytest.approx(summary["observations"] / summary["points"])
-    spaces, refused = summary["warnings"]
+    spaces, refused, doubted = summary["warnings"]
+    assert doubted == "5 images have a camera each."
     assert "spaces" in spaces
     assert refused == "1 image files could not be used (all in the report): It is a text file."
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from snakesfm.geometry.camera import Camera
-from snakesfm.ingest.cameras import Photograph, assign_cameras, group_images
+from snakesfm.ingest.cameras import Photograph, assign_cameras, group_images, warn_of_own_cameras
 from snakesfm.ingest.exif import Exif
 
 PHONE = Exif("DJI", "FC6310", focal_mm=8.8)
@@ -82,6 +82,70 @@ def test_a_few_strays_do_not_part_a_video():
     assert group_sizes(photos("a", [*video, (720, 1280), *strays]) + phones) == [1] * 5 + [11]
     # too many: as crowd photographs, whose commonest size is not of one camera
     assert group_sizes(photos("a", video + strays) + phones) == [1] * 15
+
+
+def numbered(start, count, size, exif=None, first=0, step=1):
+    exif = exif or Exif()
+    return [Photograph(f"{start}{first + k * step:05}.jpg", *size, exif) for k in range(count)]
+
+
+FRAMES = (1920, 1080)
+FIRST, SECOND = Exif("Apple", "iPhone 12"), Exif("Apple", "iPhone 13")
+
+
+def test_frames_are_of_one_camera_whatever_lies_beside_them():
+    phones = numbered("a", 55, (4032, 3024), FIRST) + numbered("b", 1, (4032, 3024), SECOND)
+    assert group_sizes(numbered("frame_", 300, FRAMES, step=30) + phones) == [1, 55, 300]
+    beside = numbered("x", 1, (800, 600)) + numbered("y", 1, (500, 400), SECOND)
+    assert group_sizes(numbered("frame_", 20, FRAMES) + phones + beside) == [1, 1, 1, 20, 55]
+    # too few, and not all sizes repeat
+    assert group_sizes(numbered("frame_", 19, FRAMES) + phones + beside) == [1] * 22 + [55]
+    # two videos of one size need not be of one camera
+    two = numbered("f", 20, FRAMES) + numbered("g", 20, FRAMES)
+    assert group_sizes(two + phones + beside) == [1, 1, 1, 20, 20, 55]
+
+
+def test_few_images_of_few_cameras_share_by_series():
+    assert group_sizes(numbered("a", 18, (4000, 3000)) + numbered("b", 18, (3264, 2448))) == [18, 18]
+    assert group_sizes(numbered("a", 20, (4000, 3000)) + numbered("b", 19, (3264, 2448))) == [19, 20]
+    # one run of numbers that changes its size once
+    assert group_sizes(numbered("a", 4, (4000, 3000)) + numbered("a", 3, (3264, 2448), first=4)) == [3, 4]
+    assert group_sizes(numbered("a", 4, (4000, 3000)) + numbered("b", 2, (3264, 2448))) == [1] * 6
+    # of two names in one size, neither is a series of the folder's
+    parts = numbered("a", 4, (4000, 3000)) + numbered("b", 4, (4000, 3000))
+    assert group_sizes(parts + numbered("c", 4, (3264, 2448))) == [1] * 12
+
+
+@pytest.mark.parametrize("step", [1, 5000])
+def test_numbered_crowd_photographs_have_a_camera_each(step):
+    sizes = [(1024, 768), (1024, 683), (1024, 680)]
+    crowd = [Photograph(f"{k * step:08}.jpg", *sizes[k * k % 7 % 3], Exif()) for k in range(90)]
+    strays = [Photograph(f"s{k}.jpg", 600, 401 + k, Exif()) for k in range(4)]
+    bodies = numbered("p", 1, (600, 400), FIRST) + numbered("q", 1, (600, 400), SECOND)
+    assert group_sizes(crowd + strays + bodies) == [1] * 96
+    # all made to one size, some without EXIF
+    made = [Photograph(f"{k * step:08}.jpg", 760, 1140, (Exif(), FIRST, SECOND)[k % 3]) for k in range(90)]
+    assert group_sizes(made) == [1] * 30 + [30, 30]
+    # numbers of a web site
+    apart = numbered("", 30, (760, 1140), step=5000) + numbered("p", 12, (600, 400), FIRST) + bodies[1:]
+    assert group_sizes(apart + strays) == [1] * 35 + [12]
+
+
+def test_own_cameras_of_few_sizes_are_doubted():
+    def warn(photographs, known=None, **changes):
+        sharing = changes.get("sharing", "auto")
+        return warn_of_own_cameras(photographs, assign(photographs, known, **changes), sharing)
+
+    square = photos("a", [(760, 760)] * 6, PHONE)
+    (line,) = warn(square)
+    assert line.startswith("6 images have a camera each")
+    assert "index_images={camera_sharing: single}" in line
+    assert warn(square, sharing="single") == warn(square, sharing="per_image") == []
+    assert warn(square, [Camera("PINHOLE", 760, 760, (700.0 + k, 700, 380, 380)) for k in range(6)]) == []
+    assert warn(square + numbered("f", 6, FRAMES)) == []
+    assert warn(photos("a", [(760, 700 + k // 2) for k in range(12)])) == []
+    bodies = [Photograph(f"{k}.jpg", 760, 1140, Exif("X", f"M{k}")) for k in range(6)]
+    assert warn(bodies) == []
 
 
 def test_cropped_images_are_not_trusted():

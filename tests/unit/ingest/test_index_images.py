@@ -87,6 +87,21 @@ def test_known_cameras_and_options(tmp_path, folder):
     assert set(found.camera_models) == {"OPENCV"}
 
 
+def test_what_is_doubtful_of_cameras_is_kept_and_told(tmp_path, folder, capsys):
+    (tmp_path / "cameras.txt").write_text("1 PINHOLE 96 64 80 80 48 32\n")
+    (tmp_path / "images.txt").write_text("1 1 0 0 0 0 0 0 1 left/1.png\n\n")
+    found = index(tmp_path, folder, tmp_path / "cameras.txt")
+    assert found.camera_ids.tolist() == [0, 0, 1, 1, 1]
+    assert found.camera_sources.tolist() == ["exif", "given"]
+    (line,) = found.warnings
+    assert line.startswith(f"2 images that {tmp_path / 'images.txt'} lacks took camera 1 by their size")
+    assert f"warning: {line}" in capsys.readouterr().out.splitlines()
+    found = index(tmp_path, folder, camera_sharing="exif")
+    assert found.camera_ids.tolist() == [0, 0, 1, 2, 3]
+    assert [line.split(":")[0] for line in found.warnings] == ["3 images have a camera each"]
+    assert index(tmp_path, folder, camera_sharing="per_image").warnings.tolist() == []
+
+
 def test_too_few_images_end_with_one_sentence(tmp_path, capsys):
     images = tmp_path / "images"
     images.mkdir()

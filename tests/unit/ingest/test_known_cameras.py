@@ -3,6 +3,8 @@ import pycolmap
 import pytest
 
 from snakesfm.errors import ConfigError
+from snakesfm.ingest.cameras import Photograph
+from snakesfm.ingest.exif import Exif
 from snakesfm.ingest.known import match_known_cameras, read_known_cameras
 
 TWO = "# comment\n1 PINHOLE 800 600 700 701 400 300\n\n7 SIMPLE_RADIAL 640 480 500 320 240 -0.1\n"
@@ -17,8 +19,14 @@ def write(folder, **files):
     return folder
 
 
+def match_and_warn(known, images, exif=None):
+    exif = exif or {}
+    photographs = [Photograph(name, *size, exif.get(name, Exif())) for name, size in images.items()]
+    return match_known_cameras(known, photographs)
+
+
 def match(known, images):
-    return match_known_cameras(known, list(images), list(images.values()))
+    return match_and_warn(known, images)[0]
 
 
 def test_one_camera_is_that_of_all_images_and_scales(tmp_path):
@@ -30,7 +38,9 @@ def test_one_camera_is_that_of_all_images_and_scales(tmp_path):
     assert odd.params == pytest.approx((700 * 267 / 800, 701 / 3, 133.5, 100))
     with pytest.raises(ConfigError, match=r"turned\.jpg has 600 x 800 .*EXIF rotation"):
         match(known, {"turned.jpg": (600, 800)})
-    with pytest.raises(ConfigError, match=r"wide\.jpg has 800 x 450 "):
+    with pytest.raises(
+        ConfigError, match=r"wide\.jpg has 800 x 450 .*an images\.txt beside a cameras\.txt limits"
+    ):
         match(known, {"wide.jpg": (800, 450)})
 
 
@@ -91,9 +101,100 @@ def test_matrix(tmp_path):
     assert half.params == (350, 350.5, 200, 150)
     with pytest.raises(ConfigError, match="no scaling"):
         match(known, {"a.jpg": (800, 600), "b.jpg": (600, 800)})
-    with pytest.raises(ConfigError, match="outside the images of 200 x 150"):
+    with pytest.raises(ConfigError, match=r"about 800 x 600 pixels, but the images have 200 x 150"):
         match(known, {"a.jpg": (200, 150)})
     assert match(known, {}) == []
+
+
+@pytest.mark.parametrize(
+    ("sizes", "about"),
+    [
+        # the matrix is that of half, three quarters and twice the size
+        ([(1600, 1200)], "800 x 600"),
+        ([(1066, 800)], "800 x 600"),
+        ([(500, 375)], "800 x 600"),
+        ([(1600, 1200), (3200, 2400)], "800 x 600"),
+        # in one direction alone
+        ([(800, 1210)], "800 x 600"),
+        ([(380, 600)], "800 x 600"),
+    ],
+)
+def test_matrix_for_another_size_is_refused(tmp_path, sizes, about):
+    known = read_known_cameras(write(tmp_path, K="700 0 400\n0 701 300\n0 0 1\n") / "K.txt")
+    with pytest.raises(ConfigError, match=f"about {about} pixels, but the images have {sizes[0][0]} x"):
+        match(known, {f"{k}.jpg": size for k, size in enumerate(sizes)})
+
+
+@pytest.mark.parametrize(
+    "size",
+    # a lens off by a tenth; a third cropped away on one side, right or left, or below
+    [(880, 660), (534, 600), (1190, 600), (800, 401), (800, 450)],
+)
+def test_matrix_of_cropped_images_is_taken(tmp_path, size):
+    known = read_known_cameras(write(tmp_path, K="700 0 400\n0 701 300\n0 0 1\n") / "K.txt")
+    (camera,) = match(known, {"a.jpg": size})
+    assert (camera.width, camera.height, camera.params) == (*size, (700, 701, 400, 300))
+
+
+PHONE = Exif("Apple", "iPhone 12", focal_mm=4.2)
+OTHER = Exif("Samsung", "SM-G991B", focal_mm=5.4)
+ZOOMED = Exif("Apple", "iPhone 12", focal_mm=6.0)
+LISTED = f"1 {POSE} 1 a.jpg\n\n"
+
+
+@pytest.mark.parametrize(
+    ("listed", "unlisted", "is_known", "warnings"),
+    [
+        (PHONE, PHONE, True, 0),
+        (PHONE, ZOOMED, False, 0),
+        (PHONE, OTHER, False, 0),
+        (PHONE, Exif(), False, 0),
+        (Exif(), PHONE, False, 0),
+        (Exif(), Exif(), True, 1),
+    ],
+)
+def test_image_that_the_list_lacks_is_known_by_its_exif(tmp_path, listed, unlisted, is_known, warnings):
+    known = read_known_cameras(write(tmp_path, cameras=TWO.splitlines()[1], images=LISTED))
+    images = {"a.jpg": (800, 600), "b.jpg": (800, 600), "c.jpg": (400, 300)}
+    found, lines = match_and_warn(known, images, {"a.jpg": listed, "b.jpg": unlisted, "c.jpg": listed})
+    assert [camera is not None for camera in found] == [True, is_known, False]
+    assert len(lines) == warnings
+    for line in lines:
+        assert f"1 images that {tmp_path / 'images.txt'} lacks took camera 1 by their size" in line
+
+
+def test_one_camera_for_several_models_is_doubted(tmp_path):
+    images = {"a.jpg": (800, 600), "b.jpg": (400, 300), "c.jpg": (800, 600)}
+    for files in ({"cameras": TWO.splitlines()[1]}, {"K": "700 0 400\n0 701 300\n0 0 1\n"}):
+        (name,) = files
+        known = read_known_cameras(write(tmp_path / name, **files))
+        found, lines = match_and_warn(known, images, {"a.jpg": PHONE, "b.jpg": OTHER})
+        assert all(camera is not None for camera in found)
+        assert len(lines) == 1
+        assert (
+            f"{name}.txt gives one camera to images of 2 camera models in EXIF (SM-G991B, iPhone 12)"
+            in lines[0]
+        )
+        assert match_and_warn(known, images, {"a.jpg": PHONE, "b.jpg": ZOOMED})[1] == []
+    known = read_known_cameras(write(tmp_path / "two", cameras=TWO))
+    by_size = {"a.jpg": (800, 600), "b.jpg": (640, 480)}
+    assert match_and_warn(known, by_size, {"a.jpg": PHONE, "b.jpg": OTHER})[1] == []
+
+
+@pytest.mark.parametrize("cameras", [SAME, SAME.splitlines()[0]])
+def test_list_with_other_folders_goes_by_file_names(tmp_path, cameras):
+    last = 2 if cameras == SAME else 1
+    images = f"1 {POSE} 1 images/A_1.jpg\n\n2 {POSE} {last} images/B_1.jpg\n\n"
+    known = read_known_cameras(write(tmp_path, cameras=cameras, images=images))
+    exif = {"A_1.jpg": PHONE, "B_1.jpg": OTHER}
+    found, lines = match_and_warn(known, dict.fromkeys((*exif, "C.jpg"), (800, 600)), exif)
+    assert [camera and camera.params[0] for camera in found] == [700, 710 if last == 2 else 700, None]
+    assert lines == []
+    with pytest.raises(
+        ConfigError,
+        match=r"images\.txt names none of the images \(it has 'images/A_1\.jpg', the folder 'x\.jpg'\)",
+    ):
+        match(known, {"x.jpg": (800, 600), "y.jpg": (800, 600)})
 
 
 @pytest.mark.parametrize(

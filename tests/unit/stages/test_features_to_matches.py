@@ -85,6 +85,7 @@ class Scene:
             camera_sources=["given"],
             refused_names=["bad.jpg"],
             refused_reasons=["bad.jpg is cut off."],
+            warnings=[],
         )
         index.write(self.file("index"), Header("index_images", 1, "scene"))
 

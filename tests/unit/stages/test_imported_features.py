@@ -41,6 +41,7 @@ def extract(tmp_path):
             camera_sources=[],
             refused_names=[],
             refused_reasons=[],
+            warnings=[],
             **{name: np.full(len(names), value) for name, value in columns.items()},
         ).write(tmp_path / "index.h5", Header("index_images", 1, "scene"))
         with h5py.File(tmp_path / "features.h5", "w") as file:

@@ -33,6 +33,7 @@ def write_index(folder, sizes):
         camera_sources=[],
         refused_names=[],
         refused_reasons=[],
+        warnings=[],
         **{name: np.full(count, value) for name, value in columns.items()},
     ).write(folder / "index.h5", HEADER)
 

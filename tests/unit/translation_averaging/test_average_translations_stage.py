@@ -39,6 +39,7 @@ def write_inputs(folder, truth, rotations, kinds=None, labels=None):
         camera_sources=sources,
         refused_names=[],
         refused_reasons=[],
+        warnings=[],
     )
     cameras = CalibratedCameras(
         models=models,

@@ -50,6 +50,7 @@ def write_inputs(folder: Path, views: Any, source: str, enlarged: int = 1) -> di
         camera_sources=np.array(sources, dtype=object),
         refused_names=np.array([], dtype=object),
         refused_reasons=np.array([], dtype=object),
+        warnings=np.zeros(0, dtype=object),
     ).write(folder / "index.h5", HEADER)
     if source == "given":
         CalibratedCameras(

@@ -37,6 +37,7 @@ def write_index(path, header):
         camera_sources=["default"],
         refused_names=[],
         refused_reasons=[],
+        warnings=[],
     ).write(path, header)
 
 
