@@ -140,7 +140,9 @@ def test_names_and_files_of_all_kinds(workflow, small_scene: Path) -> None:
     scene = workflow.folder / "out put" / "Fotos von heute"
     summary = json.loads((scene / "export_model" / "summary.json").read_text())
     assert summary["images"] == 14
-    assert summary["registered_images"] == 14
+    # the twin is left out, as the report says
+    assert summary["not_registered"] == ["twin of brace.jpg"]
+    assert any("1 images are copies of others" in line for line in outcome.summary)
     log = (scene / "logs" / "index_images" / "job.log").read_text()
     assert "png.NEF" not in log
     assert any("warning: 4 image files could not be used" in line for line in outcome.summary)
@@ -151,6 +153,7 @@ def test_names_and_files_of_all_kinds(workflow, small_scene: Path) -> None:
         assert (scene / "export_model" / frame["file_path"]).is_file()
     report = (scene / "render_report" / "index.html").read_text()
     assert "truncated.jpg" in report
+    assert "which stands for it" in report
 
 
 def test_two_groups_that_do_not_meet_give_the_larger_one(workflow, small_scene: Path) -> None:

@@ -80,7 +80,7 @@ UNTRUSTED_PLACE = (
     "agree with it, or they lie on one line."
 )
 
-COPIES = "{count} images are copies of others, byte for byte, and were left out: the others stand for them."
+COPIES = "{count} images are copies of others, byte for byte, and are left out: the others stand for them."
 
 
 def run(job: StageJob) -> None:
