@@ -48,9 +48,10 @@ def file_digest(path: str, *beside: str) -> str:
     if not path:
         return ""
     root = Path(path).expanduser()
-    files = sorted(p for p in root.rglob("*") if p.suffix in {".txt", ".bin"})
     if root.is_file():
         files = [root, *(other for name in beside if (other := root.with_name(name)).is_file())]
+    else:
+        files = sorted(p for p in root.rglob("*") if p.suffix in {".txt", ".bin"})
     digest = hashlib.sha256()
     for file in files:
         digest.update(file.name.encode() + b"\0" + file.read_bytes())

@@ -43,6 +43,11 @@ class Call:
         params, files, threads, log = text.removesuffix("\n").split("\n", 3)
         return cls(stage, json.loads(params), json.loads(files), int(threads), Path(log))
 
+    def input_paths(self) -> list[Path]:
+        """All files that the job reads."""
+        named = self.files["inputs"].values()
+        return [Path(file) for files in named for file in ([files] if isinstance(files, str) else files)]
+
 
 def run_job(stage: str) -> None:
     """Run one stage as the Snakemake job that standard input describes.
@@ -59,7 +64,7 @@ def run_job(stage: str) -> None:
     terminal = _redirect_to_log(call.log)
     try:
         job = _bind(call, terminal)
-        _check_inputs(job)
+        _check_inputs(call)
         module = importlib.import_module(f"snakesfm.stages.{stage}")
         started, before = time.time(), _processor_seconds()
         print(f"{clock(started)} {stage} {job.output}", flush=True)
@@ -150,12 +155,11 @@ def _keep_former(job: Any, module: Any) -> None:
         print(f"warning: {former} could not be kept ({error}); a re-run computes everything anew.")
 
 
-def _check_inputs(job: Any) -> None:
+def _check_inputs(call: Call) -> None:
     """Refuse input files that are damaged or not of this scene and configuration."""
     from snakesfm.artifacts.checks import check_inputs
 
-    paths = [path for name in job.inputs for path in job.paths(name)]
-    check_inputs(paths, job.scene, job.upstream)
+    check_inputs(call.input_paths(), call.files["scene"], call.files["upstream"])
 
 
 def _share(job: Any, module: Any) -> None:
@@ -180,10 +184,8 @@ def _damage_behind(call: Call, error: Exception) -> Exception | None:
         isinstance(error, SnakesfmError) and not isinstance(error, ArtifactError)
     ):
         return None
-    named = call.files["inputs"].values()
-    paths = [path for value in named for path in ([value] if isinstance(value, str) else value)]
     try:
-        check_content(map(Path, paths))
+        check_content(call.input_paths())
     except ArtifactError as damage:
         return damage
     except Exception:

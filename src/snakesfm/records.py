@@ -16,6 +16,8 @@ MAKES_NOTHING = re.compile(
     r"--(dry-?run|touch|unlock|lint|report|archive|l[tipu]|list.*|summary|detailed-summary|dag|rulegraph|filegraph|"
     r"d3dag|cleanup-.*|delete-.*|containerize|generate-unit-tests|export-cwl|print-compilation)(=.*)?"
 )
+# it does not make all of its targets, or keeps no records
+MAKES_PART = frozenset(("--until", "-U", "--omit-from", "-O", "--drop-metadata"))
 # the longest name of a file, less the mark of a part that goes on
 PART = 254
 # times pass through floating point

@@ -16,7 +16,7 @@ from snakesfm import slurm
 from snakesfm.errors import ConfigError
 from snakesfm.job_logs import find_cost
 from snakesfm.plan import Plan
-from snakesfm.records import forget, unrecorded_files
+from snakesfm.records import MAKES_PART, forget, unrecorded_files
 from snakesfm.scene_plan import ScenePlan
 
 LOCK_NAME = ".snakesfm.lock"
@@ -48,7 +48,7 @@ class Run:
         """
         self._refuse_locked()
         for scene in self.plan.scenes.values():
-            for path in unrecorded_files(scene.results(asked)):
+            for path in unrecorded_files(() if asked & MAKES_PART else scene.results(asked)):
                 with contextlib.suppress(OSError):
                     forget(path)
             unknown = unrecorded_files(scene.artifacts())

@@ -52,8 +52,6 @@ STAGES_IN_DETECTOR_PIXELS = (
 )
 IMAGE_LISTS = ("images.txt", "images.bin")
 """Beside known cameras: which image is of which."""
-PARTIAL = frozenset(("--until", "-U", "--omit-from", "-O", "--drop-metadata"))
-"""Words of Snakemake's command line by which it does not make all of its targets, or keeps no records."""
 STAGES_WITH_NETWORKS = ("extract_features", "describe_images", "match_pairs")
 
 
@@ -282,8 +280,6 @@ class ScenePlan:
         ----------
         asked : the words of Snakemake's command line, targets among them.
         """
-        if asked & PARTIAL:
-            return []
         databases, hloc = "databases" in asked, "hloc" in asked
         files = [self.database_file()] if databases else []
         files += self.hloc_files() if hloc else []

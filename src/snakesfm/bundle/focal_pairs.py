@@ -7,6 +7,7 @@ not, as of anamorphic video, the images tell.
 """
 
 from collections.abc import Collection, Sequence
+from dataclasses import replace
 
 import cv2  # noqa: F401 - must be loaded before pycolmap, whose PNG library clashes otherwise
 import pycolmap
@@ -86,13 +87,16 @@ def with_one_focal(camera: Camera) -> Camera:
     """A camera of two focal lengths with the horizontal one alone, and its radial terms."""
     model = ONE_FOCAL_MODELS[camera.model]
     f, _, cx, cy, *terms = camera.params
-    count = len(pycolmap.Camera.create_from_model_name(1, model, f, 1, 1).extra_params_idxs())
-    return Camera(model, camera.width, camera.height, (f, cx, cy, *terms[:count]), camera.source)
+    return replace(camera, model=model, params=(f, cx, cy, *terms[: _term_count(model)]))
 
 
 def with_two_focals(camera: Camera, model: str) -> Camera:
     """A camera of one focal length as one of two, whose other terms are zero."""
     f, cx, cy, *terms = camera.params
-    count = len(pycolmap.Camera.create_from_model_name(1, model, f, 1, 1).extra_params_idxs())
-    padded = (*terms, *[0.0] * (count - len(terms)))
-    return Camera(model, camera.width, camera.height, (f, f, cx, cy, *padded), camera.source)
+    zeros = [0.0] * (_term_count(model) - len(terms))
+    return replace(camera, model=model, params=(f, f, cx, cy, *terms, *zeros))
+
+
+def _term_count(model: str) -> int:
+    """How many terms of distortion a camera model has."""
+    return len(pycolmap.Camera.create_from_model_name(1, model, 1.0, 1, 1).extra_params_idxs())

@@ -105,7 +105,9 @@ def refine_angles(
 
 def _cut_landmarks(problem: PositioningProblem, most: int) -> tuple[PositioningProblem, Array]:
     """The rays by landmarks, numbered from 0, of at most ``most`` rays, and the track (m) of each."""
-    tracks, row, lengths = np.unique(problem.ray_tracks, return_inverse=True, return_counts=True)
+    problem, tracks = problem.number_tracks()
+    row = problem.ray_tracks
+    lengths = np.bincount(row, minlength=len(tracks))
     position = np.arange(len(row)) - (np.cumsum(lengths) - lengths)[row]
     pieces = -(-lengths // most)
     # Every n-th ray of a track: neighbouring images would see a landmark from one side.

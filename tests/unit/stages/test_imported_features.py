@@ -4,12 +4,12 @@ import cv2
 import h5py
 import numpy as np
 import pytest
+from plain_index import write_plain_index
 
-from snakesfm.artifacts import Header, ImageIndex, LocalFeatures
+from snakesfm.artifacts import LocalFeatures
 from snakesfm.config.extract_features import ExtractFeaturesOptions
 from snakesfm.errors import ConfigError
 from snakesfm.features.keypoints import KeypointSet
-from snakesfm.geometry.camera import PARAM_SLOTS
 from snakesfm.matching.matcher import create_matcher
 from snakesfm.retrieval.vlad import describe_vlad
 from snakesfm.stages import extract_features
@@ -28,22 +28,7 @@ def extract(tmp_path):
         for name in names:
             pixels = rng.integers(0, 255, (HEIGHT, WIDTH), dtype=np.uint8)
             cv2.imwrite(str(tmp_path / name), pixels)
-        columns = {"orientations": 1, "duplicate_of": -1, "blocks": 0, "camera_ids": 0}
-        ImageIndex(
-            names=names,
-            sizes=np.tile([WIDTH, HEIGHT], (len(names), 1)),
-            sha256=names,
-            focal_exif_px=np.full(len(names), np.nan),
-            gps=np.full((len(names), 3), np.nan),
-            camera_models=[],
-            camera_sizes=np.zeros((0, 2), int),
-            camera_params=np.zeros((0, PARAM_SLOTS)),
-            camera_sources=[],
-            refused_names=[],
-            refused_reasons=[],
-            warnings=[],
-            **{name: np.full(len(names), value) for name, value in columns.items()},
-        ).write(tmp_path / "index.h5", Header("index_images", 1, "scene"))
+        write_plain_index(tmp_path / "index.h5", names, [(WIDTH, HEIGHT)] * len(names), names)
         with h5py.File(tmp_path / "features.h5", "w") as file:
             for name, group in arrays.items():
                 for key, values in group.items():

@@ -3,13 +3,13 @@
 import cv2
 import numpy as np
 import pytest
+from plain_index import write_plain_index
 
-from snakesfm.artifacts import Header, ImageIndex, LocalFeatures, PairMatches
+from snakesfm.artifacts import Header, LocalFeatures, PairMatches
 from snakesfm.artifacts.pairs import PairCoordinates
 from snakesfm.config.index_matches import IndexMatchesOptions
 from snakesfm.config.match_pairs import MatchPairsOptions
 from snakesfm.config.merge_keypoints import MergeKeypointsOptions
-from snakesfm.geometry.camera import PARAM_SLOTS
 from snakesfm.stages import index_matches, match_pairs, merge_keypoints
 from snakesfm.stages.job import StageJob
 
@@ -19,23 +19,8 @@ SPREAD_PX = 1.0
 
 def write_index(folder, sizes):
     """An index of images 0.jpg, 1.jpg and so on, of these sizes."""
-    count = len(sizes)
-    columns = {"orientations": 1, "duplicate_of": -1, "blocks": 0, "camera_ids": 0}
-    ImageIndex(
-        names=[f"{k}.jpg" for k in range(count)],
-        sizes=np.array(sizes),
-        sha256=[""] * count,
-        focal_exif_px=np.full(count, np.nan),
-        gps=np.full((count, 3), np.nan),
-        camera_models=[],
-        camera_sizes=np.zeros((0, 2), int),
-        camera_params=np.zeros((0, PARAM_SLOTS)),
-        camera_sources=[],
-        refused_names=[],
-        refused_reasons=[],
-        warnings=[],
-        **{name: np.full(count, value) for name, value in columns.items()},
-    ).write(folder / "index.h5", HEADER)
+    names = [f"{k}.jpg" for k in range(len(sizes))]
+    write_plain_index(folder / "index.h5", names, sizes, [""] * len(sizes))
 
 
 @pytest.fixture
