@@ -10,7 +10,7 @@ from snakesfm.config.base import StageOptions
 class AverageRotationsOptions(StageOptions):
     """Options of averaging relative rotations to absolute ones."""
 
-    stage_version: ClassVar[int] = 5
+    stage_version: ClassVar[int] = 6
 
     method: Literal["two_stage", "irls", "shonan"] = "two_stage"
     """Averager: robust pass and covariance-weighted refinement, L1 and IRLS only, or Shonan averaging."""

@@ -10,7 +10,7 @@ from snakesfm.config.base import StageOptions
 class AverageTranslationsOptions(StageOptions):
     """Options of positioning the cameras, their rotations being known."""
 
-    stage_version: ClassVar[int] = 8
+    stage_version: ClassVar[int] = 9
 
     method: Literal["scale_chain", "translation_recovery", "global_positioning"] = "scale_chain"
     """First guess: baselines compared by landmarks, gtsam's recovery, or pycolmap's global positioning."""

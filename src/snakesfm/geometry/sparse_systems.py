@@ -1,4 +1,4 @@
-"""Large sparse systems without a factor, whose size grows faster than the number of cameras."""
+"""Sparse systems, large ones without a factor, whose size grows faster than the number of cameras."""
 
 from typing import Any
 
@@ -6,6 +6,34 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[Any]
+
+FACTORED_UNKNOWNS = 5000
+"""Unknowns up to which a graph's factor costs less than a second; its cost grows faster than the graph."""
+
+
+def solve_spd(
+    matrix: Any,
+    right: Array,
+    block: int = 1,
+    factored_up_to: int = FACTORED_UNKNOWNS,
+    tolerance: float = 1e-8,
+    iterations: int = 1500,
+) -> Array:
+    """Solution (n,k) of a sparse symmetric positive definite system.
+
+    By conjugate gradients for more than ``factored_up_to`` unknowns; by a sparse factor for fewer, or where
+    these do not converge. The others are the parameters of :func:`conjugate_gradients`.
+    """
+    from scipy.sparse.linalg import splu
+
+    if matrix.shape[0] > factored_up_to:
+        iterated = conjugate_gradients(matrix, right, block, tolerance, iterations)
+        if iterated is not None:
+            return iterated
+    factor = splu(
+        matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
+    )
+    return np.asarray(factor.solve(right))
 
 
 def conjugate_gradients(

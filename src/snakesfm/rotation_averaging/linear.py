@@ -6,15 +6,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from snakesfm.geometry.rotations import exp_so3, log_so3
-from snakesfm.geometry.sparse_systems import conjugate_gradients
+from snakesfm.geometry.sparse_systems import solve_spd
 
 Array = NDArray[Any]
 
 DIRECT_DEGREE = 30
 """Mean degree up to which the sparse factor is small; denser graphs converge fast without one."""
-
-FACTORED_UNKNOWNS = 5000
-"""Unknowns up to which such a factor costs less than a second; its cost grows faster than the graph."""
 
 DENSE_SIZE = 1000
 """Unknowns up to which a system of a denser graph is factored as a full matrix."""
@@ -56,7 +53,7 @@ def solve_isotropic(node_count: int, pairs: Array, weights: Array, residuals: Ar
         axis=1,
     )
     increments = np.zeros((node_count, 3))
-    increments[1:] = _solve_spd(laplacian[1:, 1:], right[1:], 2.0 * len(pairs) / node_count)
+    increments[1:] = _solve(laplacian[1:, 1:], right[1:], 2.0 * len(pairs) / node_count)
     return increments
 
 
@@ -84,30 +81,17 @@ def solve_anisotropic(node_count: int, pairs: Array, information: Array, residua
         right[:, axis] = np.bincount(tails, weighted[:, axis], node_count)
         right[:, axis] -= np.bincount(heads, weighted[:, axis], node_count)
     increments = np.zeros(size)
-    solved = _solve_spd(hessian[3:, 3:], right.ravel()[3:, None], 2.0 * len(pairs) / node_count, block=3)
+    solved = _solve(hessian[3:, 3:], right.ravel()[3:, None], 2.0 * len(pairs) / node_count, block=3)
     increments[3:] = solved[:, 0]
     return increments.reshape(node_count, 3)
 
 
-def _solve_spd(matrix: Any, right: Array, mean_degree: float, block: int = 1) -> Array:
-    """Solution (n,k) of a sparse symmetric positive definite system."""
+def _solve(matrix: Any, right: Array, mean_degree: float, block: int = 1) -> Array:
+    """Solution (n,k) of a graph's symmetric positive definite system."""
     from scipy.linalg import cho_factor, cho_solve
-    from scipy.sparse import diags_array
-    from scipy.sparse.linalg import cg, splu
 
-    if mean_degree <= DIRECT_DEGREE and matrix.shape[0] > FACTORED_UNKNOWNS:
-        iterated = conjugate_gradients(matrix, right, block)
-        if iterated is not None:
-            return iterated
     if mean_degree <= DIRECT_DEGREE:
-        factor = splu(
-            matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
-        )
-        solution: Array = factor.solve(right)
-        return solution
+        return solve_spd(matrix, right, block)
     if matrix.shape[0] <= DENSE_SIZE:
         return np.asarray(cho_solve(cho_factor(matrix.toarray(), overwrite_a=True), right))
-    preconditioner = diags_array(1.0 / matrix.diagonal())
-    matrix = matrix.tocsr()
-    columns = [cg(matrix, column, rtol=1e-6, maxiter=2000, M=preconditioner)[0] for column in right.T]
-    return np.stack(columns, axis=1)
+    return solve_spd(matrix, right, factored_up_to=DENSE_SIZE, tolerance=1e-6, iterations=2000)

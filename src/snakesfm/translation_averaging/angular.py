@@ -6,14 +6,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from snakesfm.geometry.sparse_systems import conjugate_gradients
+from snakesfm.geometry.sparse_systems import solve_spd
 from snakesfm.translation_averaging.landmarks import intersect, perpendicular, sum_by
 from snakesfm.translation_averaging.problem import PositioningProblem
 
 Array = NDArray[Any]
 
-DIRECT_CAMERAS = 300
-"""Cameras up to which the reduced system is factored; the factor of a larger one grows faster than it."""
+FACTORED_UNKNOWNS = 900
+"""Unknowns up to which the reduced system, which is denser than a graph's, is factored."""
 
 CG_TOLERANCE = 1e-4
 
@@ -21,7 +21,7 @@ RAYS_PER_LANDMARK = 64
 """Rays beyond which a landmark is cut: the blocks that it fills grow with their square."""
 
 PAIRS_AT_ONCE = 1_000_000
-"""""Products of two rays of one landmark that are held at once."""
+"""Products of two rays of one landmark that are held at once."""
 
 
 @dataclass(frozen=True)
@@ -225,7 +225,7 @@ def _step(
     rows = np.broadcast_to(3 * row[:, None, None] + np.arange(3)[:, None], shape)
     columns = np.broadcast_to(3 * column[:, None, None] + np.arange(3), shape)
     matrix = coo_matrix((blocks.ravel(), (rows.ravel(), columns.ravel())), shape=(3 * cameras,) * 2).tocsc()
-    delta = solve_blocks(matrix, reduced_g)
+    delta = solve_spd(matrix, reduced_g.reshape(-1, 1), 3, FACTORED_UNKNOWNS, CG_TOLERANCE).reshape(-1, 3)
     pull = sum_by(np.einsum("qij,qj->qi", ray_h, delta[ray_column]), track_row, landmarks)
     move = np.einsum("pij,pj->pi", inverse, point_g + pull)
     return delta, move
@@ -244,26 +244,3 @@ def _blocks(structure: _Structure, gain: Array, ray_h: Array, edge_h: Array, cam
     blocks[edges] -= edge_h
     blocks[structure.groups[pairs + len(edge_h) :]] += camera_h
     return blocks
-
-
-def solve_blocks(matrix: Any, right: Array, direct_up_to: int = DIRECT_CAMERAS) -> Array:
-    """Solution (n,3) of a sparse symmetric positive definite system of 3x3 blocks.
-
-    By a sparse factor, or for more than ``direct_up_to`` blocks by conjugate gradients. Where these do not
-    converge, by the factor after all.
-
-    Parameters
-    ----------
-    matrix : (3n,3n) sparse.
-    right : (n,3).
-    """
-    from scipy.sparse.linalg import splu
-
-    if len(right) > direct_up_to:
-        solution = conjugate_gradients(matrix, right.reshape(-1, 1), 3, CG_TOLERANCE)
-        if solution is not None:
-            return solution.reshape(-1, 3)
-    factor = splu(
-        matrix, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True}, diag_pivot_thresh=0.0
-    )
-    return np.asarray(factor.solve(right.ravel()).reshape(-1, 3))

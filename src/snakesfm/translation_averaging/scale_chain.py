@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from snakesfm.geometry.sparse_systems import conjugate_gradients
+from snakesfm.geometry.sparse_systems import solve_spd
 from snakesfm.translation_averaging.clusters import join_clusters
 from snakesfm.translation_averaging.landmarks import sum_by
 from snakesfm.translation_averaging.problem import PositioningProblem
@@ -20,8 +20,6 @@ Array = NDArray[Any]
 FIRST_SCALE = 16.0
 IRLS_ROUNDS = 12
 IRLS_TOLERANCE = 5e-3
-FACTORED_UNKNOWNS = 5000
-"""Unknowns up to which a Laplacian is factored; the factor of a larger one grows faster than it."""
 
 
 def shared_rays(problem: PositioningProblem) -> tuple[Array, Array, Array]:
@@ -213,7 +211,7 @@ def _log_baselines(edges: Array, rows: Array, log_depths: Array, weights: Array,
         mean_value = np.bincount(row, weights=w * values) / per_row
         right = np.bincount(column, weights=w * (mean_value[row] - values))
         matrix = csc_matrix(laplacian + diags(1e-9 * laplacian.diagonal()))
-        unknown = _solve(matrix, right[:, None])[:, 0]
+        unknown = solve_spd(matrix, right[:, None])[:, 0]
         if np.abs(unknown - before).max() < IRLS_TOLERANCE:
             break
         total = values + unknown[column]
@@ -254,19 +252,9 @@ def _link(
         right = np.zeros((len(names), 3))
         np.add.at(right, ends[:, 1], vectors * w[:, None])
         np.add.at(right, ends[:, 0], -vectors * w[:, None])
-        place = _solve(matrix, right)
+        place = solve_spd(matrix, right)
         gap = place[ends[:, 1]] - place[ends[:, 0]] - vectors
         relative = np.linalg.norm(gap, axis=1) / baselines[taken]
         robust = 1.0 / np.maximum(relative, 0.01)
     centers[names] = place - np.median(place, axis=0)
     return centers
-
-
-def _solve(matrix: Any, right: Array) -> Array:
-    """Solution (n,k) of a Laplacian's system: factored where small or where iterations do not converge."""
-    from scipy.sparse.linalg import splu
-
-    solution = conjugate_gradients(matrix, right) if len(right) > FACTORED_UNKNOWNS else None
-    if solution is None:
-        solution = splu(matrix, permc_spec="MMD_AT_PLUS_A").solve(right)
-    return np.asarray(solution)

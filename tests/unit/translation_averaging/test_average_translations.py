@@ -5,7 +5,7 @@ import pytest
 
 from snakesfm.geometry.rotations import angle_between
 from snakesfm.synthetic.problems import make_problem, perturb_rotations
-from snakesfm.translation_averaging.angular import refine_angles, solve_blocks
+from snakesfm.translation_averaging.angular import refine_angles
 from snakesfm.translation_averaging.average import average_translations, normalize_gauge
 from snakesfm.translation_averaging.averagers import (
     GlobalPositioning,
@@ -329,28 +329,6 @@ def test_result_does_not_depend_on_the_order_of_edges():
     two = average_translations(problem.select_edges(order), ScaleChain(), LIMITS).centers
     assert np.allclose(one, two, atol=1e-6)
     assert np.array_equal(one, average_translations(problem, ScaleChain(), LIMITS).centers)
-
-
-def test_conjugate_gradients_solve_as_the_factor_does_and_hand_over_where_they_fail():
-    from scipy.sparse import eye_array, kron, random_array
-
-    rng = np.random.default_rng(0)
-    links = random_array((60, 60), density=0.1, rng=rng)
-    blocks = kron(links @ links.T, rng.uniform(0.5, 1.0, 3) * np.eye(3)) + 0.1 * eye_array(180)
-    right = rng.normal(size=(60, 3))
-    factored = solve_blocks(blocks.tocsc(), right)
-    iterated = solve_blocks(blocks.tocsc(), right, direct_up_to=0)
-    np.testing.assert_allclose(blocks @ factored.ravel(), right.ravel(), atol=1e-9)
-    assert 1e-12 < np.abs(iterated - factored).max() < 1e-2 * np.abs(factored).max()
-    # a chain of 700 links that hardly holds takes more iterations than are allowed
-    chain = np.zeros((700, 700))
-    place = np.arange(699)
-    np.add.at(chain, (np.r_[place, place + 1], np.r_[place, place + 1]), 1.0)
-    np.add.at(chain, (np.r_[place, place + 1], np.r_[place + 1, place]), -1.0)
-    stiff = kron(chain + 1e-9 * np.eye(700), np.diag([1.0, 30.0, 900.0])).tocsc()
-    right = rng.normal(size=(700, 3))
-    solved = solve_blocks(stiff, right, direct_up_to=0)
-    assert np.linalg.norm(stiff @ solved.ravel() - right.ravel()) < 1e-3 * np.linalg.norm(right)
 
 
 @pytest.mark.parametrize(("averager", "tolerance"), [(ScaleChain(), 0.0), (GlobalPositioning(), 1e-6)])
