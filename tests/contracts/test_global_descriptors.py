@@ -49,7 +49,9 @@ class GlobalDescriptorContract:
     def test_vectors_are_of_unit_length(self, descriptor, shape):
         vector = describe(descriptor, colored(*shape), 112)
         assert vector.shape == (descriptor.size,) and vector.dtype == np.float32
-        assert np.linalg.norm(vector) == pytest.approx(1, abs=1e-5)
+        assert np.linalg.norm(vector) == pytest.approx(1, abs=np.sqrt(descriptor.size) / 4096)
+        # products of such vectors are exact, so that pairs do not depend on the blocks
+        np.testing.assert_array_equal(vector * 2048, np.rint(vector * 2048))
 
     def test_an_image_of_one_tone_resembles_none(self, descriptor):
         assert not describe(descriptor, np.full((40, 60, 3), 7, np.uint8), 112).any()
@@ -65,7 +67,7 @@ class GlobalDescriptorContract:
         apart = np.stack([describe(descriptor, image, 112) for image in images])
         for order in (np.arange(5), np.array([4, 3, 2, 1, 0]), np.array([2, 0, 4])):
             together = describe_batch(descriptor, [images[row] for row in order], 112)
-            np.testing.assert_allclose(together, apart[order], atol=1e-5)
+            np.testing.assert_allclose(together, apart[order], atol=1.01 / 2048)
         assert not apart[3].any() and np.abs(apart[0] - apart[2]).max() > 1e-3
 
     def test_a_brighter_copy_is_nearer_than_another_image(self, descriptor):
@@ -113,7 +115,7 @@ class TestNetvlad(GlobalDescriptorContract):
         whitened = flat @ values["layers.33.weights.0"].numpy().reshape(len(flat), -1)
         whitened += values["layers.33.weights.1"].numpy()
         expected = whitened / np.linalg.norm(whitened)
-        np.testing.assert_allclose(describe(descriptor, image, 112), expected, atol=2e-4)
+        np.testing.assert_allclose(describe(descriptor, image, 112), expected, atol=5e-4)
 
 
 class TestMegaloc(GlobalDescriptorContract):
@@ -164,4 +166,4 @@ class TestMegaloc(GlobalDescriptorContract):
         summed = functional.normalize(features.T @ plan[:-1].T, dim=0).flatten()
         joined = functional.normalize(torch.cat([functional.normalize(scene, dim=0), summed]), dim=0)
         expected = functional.normalize(linear(joined, "aggregator.linear"), dim=0).numpy()
-        np.testing.assert_allclose(describe(descriptor, image, 70), expected, atol=1e-5)
+        np.testing.assert_allclose(describe(descriptor, image, 70), expected, atol=2.6e-4)

@@ -10,7 +10,7 @@ from snakesfm.config.base import StageOptions
 class DescribeImagesOptions(StageOptions):
     """How an image is summed up in one vector."""
 
-    stage_version: ClassVar[int] = 2
+    stage_version: ClassVar[int] = 3
 
     method: Literal["vlad", "netvlad", "megaloc"] = "vlad"
     """Global descriptor: VLAD of the local descriptors, or a network of the whole image."""

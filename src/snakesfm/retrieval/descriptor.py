@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from snakesfm.learned.batches import equal_rows
 from snakesfm.learned.device import load_torch
 from snakesfm.learned.pictures import to_array, to_tensor
+from snakesfm.retrieval.rounding import round_units
 
 Array = NDArray[Any]
 
@@ -49,7 +50,8 @@ def describe_batch(descriptor: GlobalDescriptor, images: Sequence[Array], longer
 
     Returns
     -------
-    (B,D) float32 of unit length; zeros for an image of one tone, which resembles none.
+    (B,D) float32 of unit length up to rounding to multiples of 1/2048; zeros for an image of one tone,
+    which resembles none.
     """
     vectors = np.zeros((len(images), descriptor.size))
     small = [_shrink(rgb, longer_side_px, descriptor) for rgb in images]
@@ -60,8 +62,7 @@ def describe_batch(descriptor: GlobalDescriptor, images: Sequence[Array], longer
                 inferred = descriptor.infer(to_tensor([small[row] for row in rows]))
             vectors[rows] = to_array(inferred, np.float64)
     lengths = np.linalg.norm(vectors, axis=1, keepdims=True)
-    units: Array = (vectors / np.maximum(lengths, 1e-12)).astype(np.float32)
-    return units
+    return round_units(vectors / np.maximum(lengths, 1e-12))
 
 
 def _shrink(rgb: Array, longer_side_px: int, descriptor: GlobalDescriptor) -> Array:

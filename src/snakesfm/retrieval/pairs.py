@@ -125,7 +125,7 @@ def similar_pairs(
     Parameters
     ----------
     blocks : image rows (n_a,) of each block.
-    read_block : gives the descriptors (n_a,D) float32 of a block, of unit length or zero.
+    read_block : gives the descriptors (n_a,D) float32 of a block, as ``round_units`` has them.
     top_k : most partners that an image chooses; it may be chosen by more. Ties go to the smaller row.
     min_score : least similarity, a dot product; images without features (similarity 0) are never paired.
     held_bytes : blocks are held until their descriptors take so much memory; at least one is.
@@ -143,10 +143,10 @@ def similar_pairs(
             row: (np.full((len(own), 0), -1), np.zeros((len(own), 0), np.float32))
             for row, own in held.items()
         }
-        for column in range(len(blocks)):
-            other = held[column] if column in held else read_block(column)
-            partners = (blocks[column], other, top_k)
-            with ThreadPoolExecutor(threads) as pool:
+        with ThreadPoolExecutor(threads) as pool:
+            for column in range(len(blocks)):
+                other = held[column] if column in held else read_block(column)
+                partners = (blocks[column], other, top_k)
                 tasks = {
                     row: pool.submit(_widen, best[row], own, row == column, *partners)
                     for row, own in held.items()

@@ -6,11 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from snakesfm.retrieval.codebook import nearest_words, sum_by_word
+from snakesfm.retrieval.rounding import round_units
 
 Array = NDArray[Any]
-
-# float32 dot products of unit vectors with entries k/2048 are exact, whatever the order of the sums
-STEPS = 2048.0
 
 
 def describe_vlad(descriptors: Array, centers: Array, power: float) -> Array:
@@ -38,5 +36,4 @@ def describe_vlad(descriptors: Array, centers: Array, power: float) -> Array:
     residuals /= np.maximum(np.linalg.norm(residuals, axis=1, keepdims=True), 1e-12)
     vector = np.sign(residuals) * np.abs(residuals) ** power
     vector /= max(float(np.linalg.norm(vector)), 1e-12)
-    rounded: Array = (np.rint(vector * STEPS) / STEPS).ravel().astype(np.float32)
-    return rounded
+    return round_units(vector.ravel())

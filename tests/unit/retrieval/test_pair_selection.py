@@ -7,6 +7,7 @@ from snakesfm.config.select_pairs import SelectPairsOptions
 from snakesfm.errors import ConfigError
 from snakesfm.retrieval.listed import listed_pairs
 from snakesfm.retrieval.pairs import PairTable, natural_key, sequential_pairs, similar_pairs
+from snakesfm.retrieval.rounding import round_units
 
 
 def test_natural_order_counts():
@@ -40,10 +41,9 @@ def test_sequence_follows_the_natural_order_of_names():
     assert len(table.pairs) == 11 + 10
 
 
-def unit_vectors(count, seed=0):
-    vectors = np.random.default_rng(seed).normal(size=(count, 32)) + 0.3
-    vectors /= np.linalg.norm(vectors, axis=1, keepdims=True)
-    return (np.rint(vectors * 2048) / 2048).astype(np.float32)
+def unit_vectors(count, seed=0, size=32, shift=0.3):
+    vectors = np.random.default_rng(seed).normal(size=(count, size)) + shift
+    return round_units(vectors / np.linalg.norm(vectors, axis=1, keepdims=True))
 
 
 @pytest.mark.parametrize("block_count", [1, 2, 7, 50])
@@ -63,6 +63,18 @@ def test_similar_pairs_do_not_depend_on_the_blocks(block_count):
     }
     assert {tuple(pair) for pair in table.pairs} == expected
     np.testing.assert_array_equal(table.similarities, similarity[tuple(table.pairs.T)])
+
+
+# few steps per number and all of one sign is where the sums become largest
+@pytest.mark.parametrize("shift", [0.0, 5.0])
+def test_similarities_of_long_descriptors_are_exact_in_any_blocks(shift):
+    vectors = unit_vectors(300, 4, 8448, shift)
+    exact = np.einsum("id,jd->ij", vectors.astype(np.float64), vectors.astype(np.float64))
+    for block_count in (1, 3, 23):
+        blocks = np.array_split(np.random.default_rng(block_count).permutation(300), block_count)
+        table = similar_pairs(blocks, lambda block, blocks=blocks: vectors[blocks[block]], 299, -1.0)
+        assert len(table.pairs) > 20_000
+        np.testing.assert_array_equal(table.similarities, exact[tuple(table.pairs.T)])
 
 
 def test_blocks_that_are_held_are_not_read_again_and_change_nothing():
