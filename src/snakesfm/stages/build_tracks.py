@@ -28,7 +28,7 @@ def run(job: StageJob) -> None:
 
     Raises
     ------
-    SceneError : no track is long enough.
+    SceneError : no track is left.
     """
     options: BuildTracksOptions = job.options
     index = ImageIndex.read(job.path("index"))
@@ -38,21 +38,24 @@ def run(job: StageJob) -> None:
     kept = (graph.labels == 0) & (rotations.labels == 0) & registered[graph.pairs].all(axis=1)
     keypoints, colors = gather_image_columns(job.paths("features"), len(index.names), "keypoints", "colors")
     pairs, offsets, matches = gather_inlier_matches(job.paths("geometries"), graph.pairs[kept])
+    min_length = min(options.min_length, max(2, int(registered.sum())))
     tracks = build_tracks(
         reduce_all_keypoints(keypoints, index.sizes, job.settings),
         pairs,
         offsets,
         matches,
-        min_length=min(options.min_length, max(2, int(registered.sum()))),
+        min_length=min_length,
         sparse_observations=options.sparse_observations,
         merge_radius_px=options.merge_radius_px,
         split=options.split_conflicts,
     )
     count = len(tracks.offsets) - 1
     if count == 0:
+        # where no track is long enough, every image keeps those of two images
+        least = 2 if options.sparse_observations else min_length
         raise SceneError(
-            f"Scene '{job.scene}': no point is seen in {options.min_length} images along the "
-            f"{len(pairs)} kept image pairs: add images with more overlap or lower build_tracks.min_length."
+            f"Scene '{job.scene}': no point is seen in {least} images along the {len(pairs)} kept image "
+            + _remedies(least, 0 if options.split_conflicts else tracks.conflicts)
         )
     lengths = np.diff(tracks.offsets)
     print(
@@ -80,6 +83,17 @@ def run(job: StageJob) -> None:
         lengths_unmerged=unmerged,
         lengths_merged=merged,
     ).write(job.output, job.header)
+
+
+def _remedies(least: int, dropped: int) -> str:
+    """What to do where no track of ``least`` images is left and ``dropped`` ones saw an image twice."""
+    remedies = ["add images with more overlap"]
+    if least > 2:
+        remedies.append("lower build_tracks.min_length")
+    if dropped:
+        remedies.append("set build_tracks.split_conflicts: true")
+    left_out = f" (left out as they see one image at two places: {dropped})" if dropped else ""
+    return f"pairs{left_out}: {' or '.join(remedies)}."
 
 
 def _read_coordinates(paths: Sequence[Path], pairs: Array) -> dict[tuple[int, int], Array]:

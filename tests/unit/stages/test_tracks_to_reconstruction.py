@@ -160,8 +160,35 @@ def test_refused_edges_make_no_tracks(inputs):
     graph = ViewGraph.read(inputs["graph"])
     columns = dict(vars(graph)) | {"labels": np.ones(len(graph.pairs), np.int8)}
     ViewGraph(**columns).write(inputs["graph"], HEADER)
-    with pytest.raises(SceneError, match=r"'scene'.*min_length"):
+    kept = (
+        "'scene': no point is seen in {} images along the 0 kept image pairs: add images with more overlap"
+    )
+    with pytest.raises(SceneError, match=kept.format(2) + r"\.$"):
         run(build_tracks, BuildTracksOptions(), inputs, inputs["tracks"])
+    options = BuildTracksOptions(sparse_observations=0)
+    with pytest.raises(SceneError, match=kept.format(3) + r" or lower build_tracks\.min_length\.$"):
+        run(build_tracks, options, inputs, inputs["tracks"])
+
+
+def test_where_every_track_sees_an_image_twice_splitting_is_advised(inputs):
+    for path in inputs["geometries"]:
+        # every match of a pair is joined with the next one
+        tile = TwoViewGeometries.read(path)
+        joined = np.concatenate(
+            [tile.inliers, np.column_stack([tile.inliers[:-1, 0], tile.inliers[1:, 1]])]
+        )
+        pair_of = np.repeat(np.arange(len(tile.pairs)), np.diff(tile.offsets))
+        within = np.flatnonzero(np.diff(pair_of) == 0)
+        joined = joined[np.r_[: len(pair_of), len(pair_of) + within]]
+        pair_of = np.r_[pair_of, pair_of[within]]
+        joined = joined[np.argsort(pair_of, kind="stable")]
+        offsets = np.r_[0, np.cumsum(np.bincount(pair_of, minlength=len(tile.pairs)))]
+        replace(tile, inliers=joined, offsets=offsets).write(path, HEADER)
+    told = r"in 2 images .* pairs \(.*two places: 1\): add .*overlap or set build_tracks\.split_conflicts: true\.$"
+    with pytest.raises(SceneError, match=told):
+        run(build_tracks, BuildTracksOptions(), inputs, inputs["tracks"])
+    run(build_tracks, BuildTracksOptions(split_conflicts=True), inputs, inputs["tracks"])
+    assert len(TrackTable.read(inputs["tracks"]).offsets) > 2
 
 
 def test_poses_that_fit_nothing_are_named(inputs):
