@@ -201,7 +201,8 @@ def _stage_rows(
     results = {
         "index_images": f"{len(index.names):,} images of {len(index.camera_models):,} cameras; "
         f"{len(index.refused_names):,} files refused, {duplicates:,} duplicates",
-        "match_pairs": f"{len(pairs.pairs):,} pairs matched, {int(pairs.match_counts.sum()):,} matches",
+        "match_pairs": f"{len(pairs.pairs):,} pairs matched, {int(pairs.match_counts.sum()):,} matches "
+        "between distinct places",
         "estimate_two_view": f"{int(accepted.sum()):,} pairs accepted ({kind_text or 'none'}), "
         f"{int((~accepted).sum()):,} refused; {int(pairs.inlier_counts[accepted].sum()):,} inlier matches",
         "filter_view_graph": f"{int(np.sum(graph.labels == 0)):,} of {len(graph.labels):,} edges kept; "

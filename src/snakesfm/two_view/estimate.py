@@ -47,8 +47,8 @@ class TwoViewEstimate:
     kind : general, planar or rotation_only.
     rejection : empty if accepted, else why not: too_few_matches, estimation_failed, too_few_inliers,
         low_inlier_ratio, not_significant, indeterminate, ambiguous.
-    match_count : matches between distinct places.
-    inlier_ratio : share of inliers among them.
+    match_count : matches between distinct places whose rays are finite.
+    inlier_ratio : share of inliers among them, see ``ratio_of``.
     triangulation_angle_deg : median angle between the inliers' rays.
     significance : minus log10 of the number of false alarms, 0 where there is no pose.
     sigma_px : robust standard deviation of the inliers' Sampson errors, NaN where there is no pose.
@@ -80,7 +80,7 @@ def estimate_two_view_geometry(
 
     Parameters
     ----------
-    keypoints_i, keypoints_j : (N,2) float32 in original pixels, all keypoints of each image.
+    keypoints_i, keypoints_j : (N,2) float32 in detector pixels as the cameras, all of each image.
     matches : (M,2) int32, keypoint rows in image i and in image j, between distinct places
         (``correspondences.unify_matches``), the most confident first.
     seed : the only source of randomness.
