@@ -72,21 +72,29 @@ def choose_pairs(
     images_of = np.bincount(camera_ids, minlength=len(free))
     share = np.ceil(2.0 * per_camera / np.maximum(images_of, 1)).astype(int)
     share[images_of < 3] = per_camera
-    of_camera, of_image = np.zeros(len(free), dtype=int), np.zeros(len(camera_ids), dtype=int)
+    room = share[camera_ids].tolist()
+    least = [-most for most in room]
+    # given cameras want none
+    wanted = np.where(free, per_camera, 0).tolist()
+    wanting = int(np.count_nonzero(free & (images_of > 0)))
+    order = np.argsort(-counts, kind="stable")
+    order = order[counts[order] >= min_matches]
     chosen: list[int] = []
-    for row in np.argsort(-counts, kind="stable").tolist():
-        if counts[row] < min_matches:
+    for row, (i, j), cameras in zip(
+        order.tolist(), pairs[order].tolist(), camera_ids[pairs[order]].tolist(), strict=True
+    ):
+        if not wanting:
             break
-        ends = pairs[row]
-        cameras = np.unique(camera_ids[ends])
-        if not np.any(free[cameras] & (of_camera[cameras] < per_camera)):
+        if all(wanted[camera] <= 0 for camera in cameras) or max(room[i], room[j]) <= 0:
             continue
-        room = share[camera_ids[ends]] - of_image[ends]
-        if np.all(room <= 0) or np.any(room <= -share[camera_ids[ends]]):
+        if room[i] <= least[i] or room[j] <= least[j]:
             continue
         chosen.append(row)
-        of_camera[cameras] += 1
-        of_image[ends] += 1
+        for camera in set(cameras):
+            wanted[camera] -= 1
+            wanting -= wanted[camera] == 0
+        room[i] -= 1
+        room[j] -= 1
     return np.array(sorted(chosen), dtype=np.int64)
 
 

@@ -1,6 +1,7 @@
 """Stage calibrate_cameras: focal lengths that nobody gave, from the matches."""
 
 from collections.abc import Iterable
+from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -65,26 +66,30 @@ def _calibrate(
     scales = detector_scales(index.sizes, job.settings)
     keypoints = {image: reduce_keypoints(points, scales[image]) for image, points in found.items()}
     progress = job.progress(len(chosen), "pairs")
-    pairs = []
-    for row in chosen.tolist():
-        i, j = candidates[row, :2].tolist()
-        if i in keypoints and j in keypoints:
-            path, start, stop = places[row]
-            with PairMatches.open(path) as file:
+    pairs: dict[int, MatchedPair] = {}
+    by_file = sorted(chosen.tolist(), key=places.__getitem__)
+    for path, rows in groupby(by_file, key=lambda row: places[row][0]):
+        with PairMatches.open(path) as file:
+            columns, scores = file["matches"], file["scores"]
+            for row in rows:
+                i, j = candidates[row, :2].tolist()
+                progress.step()
+                if i not in keypoints or j not in keypoints:
+                    continue
+                part = slice(*places[row][1:])
                 # best first: the estimator draws from the first ones sooner
-                order = np.argsort(-file["scores"][start:stop], kind="stable")
-                matches = file["matches"][start:stop][order]
-            pairs.append(
-                MatchedPair(
+                order = np.argsort(-scores[part], kind="stable")
+                matches = columns[part][order]
+                pairs[row] = MatchedPair(
                     int(index.camera_ids[i]),
                     int(index.camera_ids[j]),
                     keypoints[i][matches[:, 0]],
                     keypoints[j][matches[:, 1]],
                     job.seed_for(str(index.names[i]), str(index.names[j])),
                 )
-            )
-        progress.step()
-    result = calibrate_focals(pairs, reduce_cameras(cameras, job.settings), options, job.threads)
+    # in the order of the pairs, not of the files
+    ordered = [pairs[row] for row in sorted(pairs)]
+    result = calibrate_focals(ordered, reduce_cameras(cameras, job.settings), options, job.threads)
     return restore_cameras(result.cameras, cameras, job.settings), result.sigmas, result.pair_counts
 
 
