@@ -15,3 +15,15 @@ def rows_of_each(values: Array) -> list[tuple[int, Array]]:
     order = np.argsort(values, kind="stable")
     found, starts = np.unique(values[order], return_index=True)
     return list(zip(found.tolist(), np.split(order, starts[1:]), strict=True))
+
+
+def one_to_one(pairs: Array) -> Array:
+    """Rows (K,) int64 ascending of pairs (M,2), taken in their order where both numbers are still free."""
+    taken, left = [np.zeros(0, np.int64)], np.arange(len(pairs))
+    while len(left):
+        # of the pairs that are left, one that is the first of both its numbers is taken whatever the others
+        firsts, seconds = (np.unique(pairs[left, side], return_index=True)[1] for side in (0, 1))
+        best = left[np.intersect1d(firsts, seconds, assume_unique=True)]
+        taken.append(best)
+        left = left[~(np.isin(pairs[left, 0], pairs[best, 0]) | np.isin(pairs[left, 1], pairs[best, 1]))]
+    return np.sort(np.concatenate(taken))

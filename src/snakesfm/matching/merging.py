@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from snakesfm.matching.nearest import no_matches
+from snakesfm.grouping import one_to_one
 
 Array = NDArray[Any]
 
@@ -95,16 +95,7 @@ def index_coordinates(
     )
     known = (rows >= 0).all(axis=1)
     rows, scores = rows[known], scores[known]
-    if len(rows) == 0:
-        return no_matches()
     order = np.lexsort((rows[:, 1], rows[:, 0], -scores))
-    taken: tuple[set[int], set[int]] = (set(), set())
-    kept = []
-    for row in order.tolist():
-        i, j = rows[row].tolist()
-        if i not in taken[0] and j not in taken[1]:
-            taken[0].add(i)
-            taken[1].add(j)
-            kept.append(row)
-    kept.sort(key=lambda row: int(rows[row, 0]))
+    kept = order[one_to_one(rows[order])]
+    kept = kept[np.argsort(rows[kept, 0])]
     return rows[kept].astype(np.int32), scores[kept].astype(np.float32)

@@ -91,8 +91,7 @@ def _inliers(geometries: TwoViewGeometries, row: int, matches: Array, scores: Ar
         return np.zeros((0, 2), np.int32), np.zeros(0, np.float32)
     inliers = geometries.inliers[geometries.offsets[row] : geometries.offsets[row + 1]]
     # inliers are counted by the first keypoint at a place, so that each place is there once
-    best: dict[tuple[int, int], float] = {}
-    for (first, second), score in zip(matches.tolist(), scores.tolist(), strict=True):
-        best[first, second] = max(score, best.get((first, second), 0.0))
-    kept = [best[first, second] for first, second in inliers.tolist()]
-    return inliers, np.array(kept, np.float32)
+    joined, place = np.unique(np.concatenate([inliers, matches]), axis=0, return_inverse=True)
+    best = np.zeros(len(joined), np.float32)
+    np.maximum.at(best, place[len(inliers) :], scores)
+    return inliers, best[place[: len(inliers)]]

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from snakesfm.geometry.camera import Camera
+from snakesfm.grouping import one_to_one
 from snakesfm.two_view.sampson import Correspondences
 
 Array = NDArray[Any]
@@ -53,11 +54,8 @@ def _rays(camera: Camera, keypoints: Array) -> Array:
     return np.column_stack([points, np.ones(len(points))])
 
 
-def one_to_one(matches: Array, errors: Array, selected: Array) -> Array:
+def unique_matches(matches: Array, errors: Array, selected: Array) -> Array:
     """Rows of the selected (M,) bool matches (M,2), each keypoint at most once, smallest error first."""
     rows = np.nonzero(selected)[0]
-    for side in (0, 1):
-        ordered = rows[np.lexsort((rows, np.abs(errors[rows])))]
-        _, first = np.unique(matches[ordered, side], return_index=True)
-        rows = ordered[first]
-    return np.sort(rows)
+    ordered = rows[np.argsort(np.abs(errors[rows]), kind="stable")]
+    return np.sort(ordered[one_to_one(matches[ordered])])

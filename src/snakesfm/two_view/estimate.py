@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from snakesfm.geometry.camera import Camera
 from snakesfm.geometry.rotations import angle_between
 from snakesfm.two_view.bundle import inverse_depths
-from snakesfm.two_view.correspondences import correspond, one_to_one
+from snakesfm.two_view.correspondences import correspond, unique_matches
 from snakesfm.two_view.covariance import DIRECTION_UNKNOWN_VARIANCE
 from snakesfm.two_view.estimators import ESTIMATORS, RobustPose
 from snakesfm.two_view.kinds import fit_homography, fit_rotation, planar_twins, transfer_errors_px
@@ -171,7 +171,7 @@ def _judge(
     selection_px = max(options.inlier_error_px, SELECTION_SIGMAS * refined.sigma_px)
     agrees = np.abs(refined.errors_px) < selection_px
     agrees &= _in_front(points, refined.rotation, refined.translation, refined.sigma_px)
-    rows = one_to_one(matches, refined.errors_px, agrees)
+    rows = unique_matches(matches, refined.errors_px, agrees)
     inliers = points.take(rows)
     before = float(robust.inliers.sum()) / len(matches)
     ratio = before if options.ratio_of == "estimator" else len(rows) / len(matches)

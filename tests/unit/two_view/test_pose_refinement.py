@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from snakesfm.geometry.rotations import angle_between, angle_of, exp_so3
 from snakesfm.two_view.bundle import inverse_depths, refine_bundle
-from snakesfm.two_view.correspondences import correspond, first_rows_at_place, one_to_one, unify_matches
+from snakesfm.two_view.correspondences import correspond, first_rows_at_place, unify_matches, unique_matches
 from snakesfm.two_view.sampson import (
     Correspondences,
     refine_sampson,
@@ -95,6 +95,10 @@ def test_duplicates_are_unified_and_conflicts_settled() -> None:
     places = first_rows_at_place(keypoints)
     unified = unify_matches(places, places, matches)
     assert unified.tolist() == [[0, 1], [1, 3], [3, 3]]
-    rows = one_to_one(unified, np.array([0.1, 0.5, -0.2]), np.ones(3, dtype=bool))
+    rows = unique_matches(unified, np.array([0.1, 0.5, -0.2]), np.ones(3, dtype=bool))
     assert rows.tolist() == [0, 2]
+    # the second gives way to the first, so that it does not take the third one's keypoint
+    chained = np.array([[4, 7], [5, 7], [5, 8]])
+    for errors, kept in (([0.1, -0.2, 0.3], [0, 2]), ([0.2, 0.1, 0.3], [1]), ([0.2, 0.3, -0.1], [0, 2])):
+        assert unique_matches(chained, np.array(errors), np.ones(3, dtype=bool)).tolist() == kept
     assert unify_matches(places, places, np.zeros((0, 2), dtype=np.int32)).shape == (0, 2)
