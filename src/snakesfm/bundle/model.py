@@ -13,9 +13,8 @@ import pycolmap
 from numpy.typing import NDArray
 
 from snakesfm.bundle.reading import observations_of
-from snakesfm.geometry.camera import Camera
+from snakesfm.geometry.camera import Camera, observation_errors
 from snakesfm.geometry.poses import to_rigid3d
-from snakesfm.grouping import rows_of_each
 
 Array = NDArray[Any]
 
@@ -140,16 +139,15 @@ def reprojection_errors(model: BundleModel, keypoints: Array) -> Array:
     keypoints : (L,2) pixels of the observations.
     """
     point_of = np.repeat(np.arange(len(model.points)), np.diff(model.offsets))
-    rotations = model.rotations[model.image_ids]
-    in_camera = np.einsum("lij,lj->li", rotations, model.points[point_of])
-    in_camera += model.translations[model.image_ids]
-    errors = np.full(len(point_of), np.inf)
-    ahead = np.nonzero(in_camera[:, 2] > 0)[0]
-    for camera, places in rows_of_each(model.camera_ids[model.image_ids[ahead]]):
-        rows = ahead[places]
-        projected = model.cameras[camera].to_pycolmap().img_from_cam(in_camera[rows])
-        errors[rows] = np.linalg.norm(np.asarray(projected).reshape(-1, 2) - keypoints[rows], axis=1)
-    return errors
+    return observation_errors(
+        model.cameras,
+        model.camera_ids,
+        model.rotations,
+        model.translations,
+        model.points[point_of],
+        model.image_ids,
+        keypoints,
+    )
 
 
 def mean_point_errors(errors: Array, offsets: Array) -> Array:

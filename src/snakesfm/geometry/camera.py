@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from snakesfm.geometry.poses import to_camera
 from snakesfm.grouping import rows_of_each
 
 if TYPE_CHECKING:
@@ -126,3 +127,31 @@ def undistort(cameras: Sequence[Camera], camera_ids: Array, image_ids: Array, ke
     for camera, rows in rows_of_each(camera_ids[image_ids]):
         rays[rows] = cameras[camera].normalize(keypoints[rows])
     return rays
+
+
+def observation_errors(
+    cameras: Sequence[Camera],
+    camera_ids: Array,
+    rotations: Array,
+    translations: Array,
+    points: Array,
+    image_ids: Array,
+    keypoints: Array,
+) -> Array:
+    """Reprojection errors (L,) in pixels of observations; inf behind the camera.
+
+    Parameters
+    ----------
+    cameras, camera_ids : intrinsics, and which of them each image (N,) has.
+    rotations, translations : (N,3,3) and (N,3), cam_from_world.
+    points : (L,3) the observed point of each observation, in the world.
+    image_ids, keypoints : (L,), (L,2) observations.
+    """
+    errors = np.full(len(image_ids), np.inf)
+    for image, rows in rows_of_each(image_ids):
+        in_camera = to_camera(rotations[image], translations[image], points[rows])
+        ahead = in_camera[:, 2] > 0
+        rows, camera = rows[ahead], cameras[camera_ids[image]].to_pycolmap()
+        projected = np.asarray(camera.img_from_cam(in_camera[ahead])).reshape(-1, 2)
+        errors[rows] = np.linalg.norm(projected - keypoints[rows], axis=1)
+    return errors

@@ -23,6 +23,12 @@ def translation_of(rotations: Array, centers: Array) -> Array:
     return translations
 
 
+def to_camera(rotations: Array, translations: Array, points: Array) -> Array:
+    """World points (..., 3) in the frames of cam_from_world poses: R X + t."""
+    in_camera: Array = np.einsum("...ij,...j->...i", rotations, points) + translations
+    return in_camera
+
+
 def to_rigid3d(rotation: Array, translation: Array) -> "pycolmap.Rigid3d":
     """One pose for pycolmap."""
     from snakesfm.geometry.colmap_binding import pycolmap

@@ -1,13 +1,10 @@
 """Per image: what each step made of it, and why an image has no pose."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-
-from snakesfm.geometry.camera import Camera
 
 Array = NDArray[Any]
 
@@ -36,36 +33,6 @@ class ImageCounts:
 def count_by_image(ids: Array, count: int) -> Array:
     """How often each of ``count`` images occurs in ``ids``, (count,) int64."""
     return np.bincount(np.asarray(ids, dtype=np.int64).ravel(), minlength=count)
-
-
-def observation_errors(
-    cameras: Sequence[Camera],
-    camera_ids: Array,
-    rotations: Array,
-    translations: Array,
-    points: Array,
-    image_ids: Array,
-    keypoints: Array,
-) -> Array:
-    """Reprojection errors (L,) in pixels of all observations; NaN behind the camera.
-
-    Parameters
-    ----------
-    points : (L,3) the observed point of each observation, in the world.
-    image_ids, keypoints : (L,), (L,2) observations.
-    """
-    errors = np.full(len(image_ids), np.nan)
-    order = np.argsort(image_ids, kind="stable")
-    bounds = np.searchsorted(image_ids[order], np.arange(len(camera_ids) + 1))
-    for image in range(len(camera_ids)):
-        rows = order[bounds[image] : bounds[image + 1]]
-        if len(rows) == 0:
-            continue
-        local = points[rows] @ rotations[image].T + translations[image]
-        camera = cameras[int(camera_ids[image])].to_pycolmap()
-        pixels = np.asarray(camera.img_from_cam(local), dtype=np.float64).reshape(-1, 2)
-        errors[rows] = np.linalg.norm(pixels - keypoints[rows], axis=1)
-    return errors
 
 
 def mean_by_image(values: Array, image_ids: Array, count: int) -> Array:

@@ -24,7 +24,7 @@ from snakesfm.export.undistorted import write_undistorted
 from snakesfm.geometry.camera import Camera, cameras_from_columns
 from snakesfm.geometry.earth import local_origin
 from snakesfm.geometry.lens_fit import MAX_MISFIT, fit_lenses
-from snakesfm.geometry.poses import center_of, translation_of
+from snakesfm.geometry.poses import center_of, to_camera, translation_of
 from snakesfm.ingest.masks import masks_as_large
 from snakesfm.stages.job import StageJob
 
@@ -166,7 +166,7 @@ def _lens_warnings(model: Reconstruction, cameras: list[Camera], camera_ids: np.
     some = slice(None, None, -(-len(model.image_ids) // OBSERVATIONS_OF_LENSES) or 1)
     images = model.image_ids[some]
     points = model.points[np.repeat(np.arange(len(model.points)), np.diff(model.offsets))[some]]
-    in_camera = np.einsum("lij,lj->li", model.rotations[images], points) + model.translations[images]
+    in_camera = to_camera(model.rotations[images], model.translations[images], points)
     fits = fit_lenses(
         dict(enumerate(cameras)), camera_ids[images], images, in_camera, model.keypoints[some]
     )

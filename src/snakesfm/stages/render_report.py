@@ -23,7 +23,7 @@ from snakesfm.artifacts import (
 )
 from snakesfm.artifacts.base import Array
 from snakesfm.artifacts.pairs import EDGE_LABELS, KINDS, REJECTIONS
-from snakesfm.geometry.camera import cameras_from_columns
+from snakesfm.geometry.camera import cameras_from_columns, observation_errors
 from snakesfm.job_logs import stage_costs
 from snakesfm.reporting.page import Page, render_page
 from snakesfm.reporting.plots import error_histogram, scene_map, view_axes
@@ -31,7 +31,6 @@ from snakesfm.reporting.registration import (
     ImageCounts,
     count_by_image,
     mean_by_image,
-    observation_errors,
     reason_not_registered,
 )
 from snakesfm.reporting.tables import bundle_rows, image_rows, label_counts, metric_tables

@@ -6,6 +6,8 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from snakesfm.geometry.poses import to_camera
+
 Array = NDArray[Any]
 
 
@@ -67,8 +69,7 @@ def check_points(
     count = len(points)
     track_of = np.repeat(np.arange(count), np.diff(problem.offsets))
     rotations = problem.rotations[problem.image_ids]
-    in_camera = np.einsum("lij,lj->li", rotations, points[track_of])
-    in_camera += problem.translations[problem.image_ids]
+    in_camera = to_camera(rotations, problem.translations[problem.image_ids], points[track_of])
     depths = in_camera[:, 2]
     with np.errstate(divide="ignore", invalid="ignore"):
         offsets = in_camera[:, :2] / depths[:, None] - problem.rays
