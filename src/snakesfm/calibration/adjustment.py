@@ -7,7 +7,6 @@ from typing import Any
 
 import cv2
 import numpy as np
-import poselib
 from numpy.typing import NDArray
 from scipy.sparse import coo_array, diags_array
 from scipy.sparse.linalg import splu
@@ -21,7 +20,7 @@ from snakesfm.calibration.condensed import (
 )
 from snakesfm.calibration.epipolar import EpipolarPair, cameras_of
 from snakesfm.geometry.robust import robust_sigma
-from snakesfm.two_view.estimators import poselib_camera
+from snakesfm.two_view.refinement import descend_from
 from snakesfm.two_view.sampson import (
     Correspondences,
     cauchy_weights,
@@ -229,20 +228,8 @@ def refined_pose(pair: EpipolarPair, pose: tuple[Array, Array], focals: Array) -
     """The best relative pose for these focal lengths, from a nearby one."""
     focal_i, focal_j = float(focals[pair.camera_i]), float(focals[pair.camera_j])
     mean = 0.5 * (focal_i + focal_j)
-    start = poselib.CameraPose()
-    start.R, start.t = pose
-    found, _ = poselib.refine_relative_pose(
-        pair.points_i * (mean / focal_i),
-        pair.points_j * (mean / focal_j),
-        start,
-        poselib_camera(mean),
-        poselib_camera(mean),
-        {"loss_type": "CAUCHY", "loss_scale": 1.0, "max_iterations": 20},
-    )
-    length = float(np.linalg.norm(found.t))
-    if not np.isfinite(length) or length < 1e-12:
-        return pose
-    return np.asarray(found.R), np.asarray(found.t) / length
+    points_i, points_j = pair.points_i * (mean / focal_i), pair.points_j * (mean / focal_j)
+    return descend_from(pose, points_i, points_j, mean, 1.0)
 
 
 def _linearised(

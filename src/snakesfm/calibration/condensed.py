@@ -25,8 +25,8 @@ PROJECTION = np.diag([1.0, 1.0, 0.0])
 # derivatives of U diag(1,1,0) V^T by turns of U about its three axes and of V about its first two
 TURNS = np.concatenate(
     [
-        GENERATORS.reshape(3, 3, 3) @ PROJECTION,
-        -PROJECTION @ GENERATORS.reshape(3, 3, 3)[:2],
+        GENERATORS @ PROJECTION,
+        -PROJECTION @ GENERATORS[:2],
     ]
 )
 

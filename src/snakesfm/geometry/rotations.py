@@ -14,8 +14,8 @@ IDENTITY = np.eye(3)
 GENERATORS = np.array(
     [[0, 0, 0, 0, 0, -1, 0, 1, 0], [0, 0, 1, 0, 0, 0, -1, 0, 0], [0, -1, 0, 1, 0, 0, 0, 0, 0]],
     dtype=np.float64,
-)
-"""The matrices of the cross products with x, y and z, one a row."""
+).reshape(3, 3, 3)
+"""The matrices of the cross products with x, y and z."""
 
 
 def exp_so3(vectors: Array) -> Array:
@@ -24,7 +24,7 @@ def exp_so3(vectors: Array) -> Array:
     halves = np.sqrt(np.einsum("...i,...i->...", vectors, vectors))[..., None, None] / 2.0
     sincs = np.divide(np.sin(halves), halves, out=np.ones_like(halves), where=halves > 0.0)
     cosines = np.cos(halves)
-    skew = (vectors @ GENERATORS).reshape(*vectors.shape, 3)
+    skew = (vectors @ GENERATORS.reshape(3, 9)).reshape(*vectors.shape, 3)
     outer = vectors[..., :, None] * vectors[..., None, :]
     matrices: Array = (
         (2.0 * cosines**2 - 1.0) * IDENTITY + (sincs * cosines) * skew + (sincs**2 / 2.0) * outer

@@ -5,7 +5,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from snakesfm.two_view.sampson import GENERATORS, Correspondences, cauchy_cost, cauchy_weights, solve_damped
+from snakesfm.geometry.rotations import GENERATORS
+from snakesfm.two_view.sampson import Correspondences, cauchy_cost, cauchy_weights, solve_damped
 from snakesfm.two_view.tangents import cross_matrix, perturb_pose, tangent_basis
 
 Array = NDArray[Any]

@@ -8,10 +8,9 @@ import poselib
 from numpy.typing import NDArray
 
 from snakesfm.geometry.robust import robust_sigma
-from snakesfm.geometry.rotations import exp_so3
+from snakesfm.geometry.rotations import GENERATORS, exp_so3
 from snakesfm.two_view.covariance import cauchy_variance, invert_information
 from snakesfm.two_view.sampson import (
-    GENERATORS,
     Correspondences,
     cauchy_weights,
     solve_damped,

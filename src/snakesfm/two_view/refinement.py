@@ -110,18 +110,20 @@ def descend_sampson(
     scale_px : scale of the loss in pixels of the mean focal length.
     """
     focal = points.mean_focal
-    camera = poselib_camera(focal)
-    start = poselib.CameraPose()
-    start.R, start.t = rotation, translation
-    pose, _ = poselib.refine_relative_pose(
-        points.rays_i[:, :2] * focal,
-        points.rays_j[:, :2] * focal,
-        start,
-        camera,
-        camera,
-        {"loss_type": "CAUCHY", "loss_scale": scale_px, "max_iterations": 20},
+    return descend_from(
+        (rotation, translation), points.rays_i[:, :2] * focal, points.rays_j[:, :2] * focal, focal, scale_px
     )
-    length = float(np.linalg.norm(pose.t))
+
+
+def descend_from(
+    pose: tuple[Array, Array], points_i: Array, points_j: Array, focal_px: float, scale_px: float
+) -> tuple[Array, Array]:
+    """The same for undistorted points (M,2) in pixels of one focal length, from the principal point."""
+    camera, start = poselib_camera(focal_px), poselib.CameraPose()
+    start.R, start.t = pose
+    settings = {"loss_type": "CAUCHY", "loss_scale": scale_px, "max_iterations": 20}
+    found, _ = poselib.refine_relative_pose(points_i, points_j, start, camera, camera, settings)
+    length = float(np.linalg.norm(found.t))
     if not np.isfinite(length) or length < 1e-12:
-        return rotation, translation
-    return np.asarray(pose.R), np.asarray(pose.t) / length
+        return pose
+    return np.asarray(found.R), np.asarray(found.t) / length

@@ -6,10 +6,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from snakesfm.geometry.rotations import GENERATORS
 from snakesfm.two_view.tangents import cross_matrix, perturb_pose, tangent_basis
 
 Array = NDArray[Any]
-GENERATORS = np.stack([cross_matrix(axis) for axis in np.eye(3)])
 
 
 @dataclass(frozen=True)
