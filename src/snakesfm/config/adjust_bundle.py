@@ -154,5 +154,5 @@ class AdjustBundleOptions(StageOptions):
     @model_validator(mode="after")
     def _refine_in_ever_finer_images(self) -> Self:
         if any(finer <= coarser for coarser, finer in pairwise(self.refine_finenesses)):
-            raise ValueError("refine_finenesses must ascend: each is for images finer than those before")
+            raise ValueError("refine_finenesses must increase: each resolution must exceed the one before")
         return self

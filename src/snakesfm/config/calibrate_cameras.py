@@ -53,6 +53,6 @@ class CalibrateCamerasOptions(StageOptions):
         if self.min_focal_ratio >= self.max_focal_ratio:
             raise ValueError(
                 f"min_focal_ratio {self.min_focal_ratio:g} must be below max_focal_ratio "
-                f"{self.max_focal_ratio:g}: lower the one or raise the other"
+                f"{self.max_focal_ratio:g}: lower the first or raise the second"
             )
         return self

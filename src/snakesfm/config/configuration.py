@@ -171,8 +171,8 @@ def check_spelling(values: Mapping[str, Any], arguments: Sequence[str]) -> None:
     for key in TEXT_KEYS:
         typed = [text.partition("=")[2] for text in arguments if text.startswith(f"{key}=")]
         if typed and _is_number(values.get(key)) and typed[-1] != str(values[key]):
-            remedy = f"write {key}=./{typed[-1]}" if key != "scene" else "give it another name"
-            raise ConfigError(f"Snakemake takes {key}={typed[-1]} for the number {values[key]}: {remedy}.")
+            remedy = f"write {key}=./{typed[-1]}" if key != "scene" else "choose another name"
+            raise ConfigError(f"Snakemake reads {key}={typed[-1]} as the number {values[key]}: {remedy}.")
 
 
 def _is_number(value: Any) -> bool:
@@ -256,9 +256,9 @@ def _refuse_beside_scenes(configuration: RunOptions) -> None:
         if getattr(configuration, key) == RunOptions.model_fields[key].default:
             continue
         if key in ("images", "scene"):
-            raise ConfigError(f"Give either '{key}' or 'scenes', not both: remove one of the two keys.")
+            raise ConfigError(f"Set either '{key}' or 'scenes', not both: remove one of the two keys.")
         raise ConfigError(
-            f"'{key}' beside 'scenes' belongs to none of them: write it into each scene that it is for."
+            f"'{key}' next to 'scenes' applies to none of them: move it into each scene that needs it."
         )
 
 
@@ -277,12 +277,12 @@ def list_scenes(configuration: RunOptions) -> dict[str, SceneInputs]:
         _refuse_beside_scenes(configuration)
     if re.search("[{}]", configuration.output):
         raise ConfigError(
-            f"The output folder '{configuration.output}' holds braces: give another output=DIR."
+            f"The output folder '{configuration.output}' contains braces: choose another with output=DIR."
         )
     for name in scenes:
         if not re.fullmatch(SCENE_PATTERN, name):
             raise ConfigError(
-                f"'{name}' cannot be the name of a scene: give scene=NAME, a name that holds no '/' and no "
-                "braces and does not start with a dot."
+                f"'{name}' cannot be the name of a scene: set scene=NAME to a name without '/' or braces "
+                "that does not start with a dot."
             )
     return scenes

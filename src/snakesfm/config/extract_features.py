@@ -45,5 +45,5 @@ class ExtractFeaturesOptions(StageOptions):
     @model_validator(mode="after")
     def _refuse_two_kinds_of_points(self) -> Self:
         if self.surface_points and self.view_points:
-            raise ValueError("surface_points and view_points are two kinds of points: set one of them to 0")
+            raise ValueError("surface_points and view_points cannot be combined: set one of them to 0")
         return self
