@@ -29,7 +29,7 @@ def parse(arguments: list[str]) -> argparse.Namespace:
         command.add_argument("--data", type=Path, default=DATA, help="folder of the image sets")
         command.add_argument("--sets", nargs="*", default=[], help="names of sets (all)")
         command.add_argument(
-            "--withhold-intrinsics", action="store_true", help="give known intrinsics to nobody"
+            "--withhold-intrinsics", action="store_true", help="hide known intrinsics from all methods"
         )
         command.add_argument("--threads", type=int, default=os.cpu_count())
         command.add_argument(
@@ -43,7 +43,7 @@ def parse(arguments: list[str]) -> argparse.Namespace:
     run.add_argument("--large-seeds", type=int, default=3, help="seeds on sets above 60 images")
     run.add_argument("--methods", nargs="*", choices=METHODS, default=list(METHODS))
     run.add_argument(
-        "--retime", action="store_true", help="repeat first seeds that others on the machine disturbed"
+        "--retime", action="store_true", help="repeat timings taken while other processes were running"
     )
     switch.add_argument("--options", type=Path, default=ROOT / "benchmarks" / "ablations.yaml")
     switch.add_argument("--names", nargs="*", default=[], help="names of options in that file (all)")

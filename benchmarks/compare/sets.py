@@ -92,7 +92,7 @@ def read_sets(data: Path, names: list[str], withhold_intrinsics: bool = False) -
     sets = []
     for folder in folders:
         if not (folder / "images").is_dir() or not (folder / "reference").is_dir():
-            raise ConfigError(f"{folder} is no image set: it needs images/ and reference/.")
+            raise ConfigError(f"{folder} is not an image set: it needs images/ and reference/.")
         meta = folder / "meta.yaml"
         content = yaml.safe_load(meta.read_text("utf-8")) if meta.is_file() else {}
         truth = "colmap" not in content.get("reference_source", "colmap")

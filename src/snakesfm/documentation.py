@@ -72,8 +72,8 @@ def render_config() -> str:
     describe_options()
     lines = [
         "# yaml-language-server: $schema=workflow/schemas/config.schema.json",
-        "# Every option of snakesfm with its default. As it stands it reconstructs the demo scene ('make demo').",
-        "# Change it here, in a file of your own (--configfile FILE) or per run (--config KEY=VALUE).",
+        "# Every option of snakesfm with its default. Unchanged, this reconstructs the demo scene ('make demo').",
+        "# Change options here, in a file of your own (--configfile FILE) or per run (--config KEY=VALUE).",
         "# Generated from the code by 'python -m snakesfm.documentation'.",
         "",
     ]
@@ -114,12 +114,12 @@ def render_configuration_page() -> str:
         "",
         "Options are read from `config.yaml`, then from files given with `--configfile`, then from "
         "`--config KEY=VALUE`; stage options nest: `--config 'extract_features={max_keypoints: 8000}'`. "
-        "Unknown keys are refused. Threads, memory and partitions are no options: they belong to the profile.",
+        "Unknown keys are refused. Threads, memory and partitions are not options; they are set in the profile.",
         "",
-        "Options in pixels (`_px`) of the stages after matching count in the pixels of the images as the detector sees "
-        "them, scaled down to `extract_features.max_shorter_side_px` (LoFTR: `match_pairs.longer_side_px`), so they "
-        "need not be changed for larger photographs. Keypoints that are imported are taken to come from images of "
-        "that size, too: say with the option which it was. Files hold original pixels.",
+        "In the stages after matching, options in pixels (`_px`) refer to the images as the detector sees them, "
+        "scaled down to `extract_features.max_shorter_side_px` (LoFTR: `match_pairs.longer_side_px`), so they need "
+        "not be changed for larger photographs. Imported keypoints are assumed to come from images of that size: "
+        "if it was another, set the option to it. Files hold original pixels.",
         "",
         "## The run",
         "",
@@ -177,14 +177,15 @@ def render_artifacts_page() -> str:
         "",
         "Generated from `src/snakesfm/artifacts` by `python -m snakesfm.documentation`; do not edit.",
         "",
-        "Every stage writes HDF5 files at `OUTPUT/SCENE/STAGE/FILE.h5`, one job one file, complete or not at all. "
+        "Every stage writes HDF5 files at `OUTPUT/SCENE/STAGE/FILE.h5`, one per job; a file is complete or absent. "
         "The root attributes are `artifact` (the kind below), `format_version`, `stage`, `stage_version`, `scene`, "
-        "`options` and `settings` (canonical JSON; the latter are the seed and what is no option) and `software`; "
-        "there are no timestamps, so equal runs give equal bytes. Readers refuse another kind or version.",
+        "`options` and `settings` (canonical JSON; `settings` holds the seed and other inputs that are not options) "
+        "and `software`; there are no timestamps, so equal runs give equal bytes. Readers refuse other kinds and "
+        "versions.",
         "",
         "Letters in shapes are lengths: the same letter is the same length within one file, and `P+1` is one more "
-        "than `P`. Flat tables of things that belong to others (matches of a pair, keypoints of an image) come with "
-        "row offsets. Poses are named target_from_source: `cam_from_world` maps the world to the camera, "
+        "than `P`. Items that belong to others (matches of a pair, keypoints of an image) are stored in flat tables "
+        "with row offsets. Poses are named target_from_source: `cam_from_world` maps the world to the camera, "
         "`j_from_i` maps camera i to camera j. The centre of the top-left pixel is (0.5, 0.5).",
     ]
     for cls in ARTIFACTS:

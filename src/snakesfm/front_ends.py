@@ -57,7 +57,7 @@ def check_methods(detector: str, matcher: str) -> None:
     if detectors is not None and detector not in detectors:
         raise ConfigError(
             f"match_pairs.method '{matcher}' cannot match the keypoints of extract_features.method "
-            f"'{detector}': take one of {', '.join(detectors)}, or name both at once with front_end="
+            f"'{detector}': use one of {', '.join(detectors)}, or set both at once with front_end="
             f"{next(name for name, end in FRONT_ENDS.items() if end.matcher == matcher)}."
         )
 

@@ -152,7 +152,7 @@ def _keep_former(job: Any, module: Any) -> None:
         os.link(job.output, temporary)
         temporary.replace(former)
     except OSError as error:
-        print(f"warning: {former} could not be kept ({error}); a re-run computes everything anew.")
+        print(f"warning: {former} could not be kept ({error}); a re-run will compute everything again.")
 
 
 def _check_inputs(call: Call) -> None:
@@ -212,7 +212,7 @@ def _fail(call: Call, error: Exception, terminal: Any) -> None:
         _print_trace()
     else:
         _print_trace()
-        sentence = f"Unexpected {type(error).__name__}: {error}; {call.log} holds the details."
+        sentence = f"Unexpected {type(error).__name__}: {error}; see {call.log} for details."
     print(f"snakesfm: scene '{call.files['scene']}', {call.stage}: {sentence}", file=terminal, flush=True)
     with contextlib.suppress(OSError):
         print(f"error: {sentence}", flush=True)

@@ -16,7 +16,7 @@ def _check_writable(folder: Path) -> None:
     existing = next(path for path in (folder, *folder.absolute().parents) if path.exists())
     if not existing.is_dir() or not os.access(existing, os.W_OK | os.X_OK):
         raise ConfigError(
-            f"The output folder '{folder}' cannot be written: say another with --config output=DIR."
+            f"The output folder '{folder}' cannot be written: choose another one with --config output=DIR."
         )
 
 

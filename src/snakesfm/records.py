@@ -75,9 +75,9 @@ def check_folder(snakefile: str, records: Path = RECORDS) -> None:
     place = next(folder for folder in (records.parent, Path()) if folder.is_dir())
     if not os.access(place, os.W_OK, effective_ids=True):
         raise ConfigError(
-            f"Snakemake keeps its records in '.snakemake' of the folder that it is started in, and "
+            f"Snakemake keeps its records in '.snakemake' of the folder it is started in, and "
             f"{place.resolve()} cannot be written: start it elsewhere with -s {snakefile}, "
-            "or say --directory DIR."
+            "or use --directory DIR."
         )
 
 

@@ -60,8 +60,8 @@ class Run:
             found = set_aside(unknown, scene.name, scene.options_digests, scene.settings_text)
             if found:
                 print(
-                    f"snakesfm: scene '{scene.name}': {len(found)} files of which this folder's .snakemake "
-                    f"knows nothing are renamed to *{ASIDE} and made again: {found[0]}.",
+                    f"snakesfm: scene '{scene.name}': {len(found)} files without a record in this folder's "
+                    f".snakemake were renamed to *{ASIDE} and will be recreated: {found[0]}.",
                     flush=True,
                 )
 
@@ -80,7 +80,7 @@ class Run:
             lock.seek(0)
             raise ConfigError(
                 f"Another run ({lock.read().strip() or 'unknown'}) is writing to "
-                f"'{self.plan.output}': wait for it to end, or give another output=DIR."
+                f"'{self.plan.output}': wait for it to end, or choose another output=DIR."
             ) from None
 
     def start(self, slurm_run: str = "") -> None:
@@ -105,12 +105,12 @@ class Run:
         except OSError as error:
             raise ConfigError(
                 f"The output folder '{self.plan.output}' cannot be written ({error.strerror}): "
-                "say another with --config output=DIR."
+                "choose another one with --config output=DIR."
             ) from None
         try:
             self._lock(self.lock, fcntl.LOCK_EX)
         except OSError as error:
-            print(f"snakesfm: warning: {path} cannot be locked ({error.strerror}); start one run only.")
+            print(f"snakesfm: warning: {path} cannot be locked ({error.strerror}); start only one run.")
         self._end_former_jobs()
         self.slurm_run = slurm_run
         jobs = f", SLURM run {slurm_run}" if slurm_run else ""
@@ -119,7 +119,7 @@ class Run:
         except OSError as error:
             raise ConfigError(
                 f"The output folder '{self.plan.output}' cannot be written ({error.strerror}): "
-                "free the disk, then run again."
+                "free disk space, then run again."
             ) from None
         self._bring_times_back()
         for scene in self.plan.scenes.values():
@@ -161,7 +161,7 @@ class Run:
             os.utime(file, ns=(changed, changed))
         if future:
             print(
-                f"snakesfm: warning: {len(future)} files are from the future: a clock is or was wrong.",
+                f"snakesfm: warning: {len(future)} files had times in the future: a clock is or was wrong.",
                 flush=True,
             )
 
@@ -211,8 +211,8 @@ class Run:
                 sentences.append(f"{lines[-1].removeprefix('error: ')} (log: {log})")
             elif lines and not find_cost(lines[-1]):
                 sentences.append(
-                    f"{log.parent.name} {log.stem} was ended from outside, for its memory or time, by "
-                    f"a person or with its node (log: {log})"
+                    f"{log.parent.name} {log.stem} was killed from outside (out of memory, time limit, "
+                    f"cancelled, or its node failed) (log: {log})"
                 )
         return sentences
 
@@ -245,10 +245,10 @@ class Run:
             database = Path(scene.database_file())
             made = f"COLMAP database in {database}, " if database.is_file() else ""
             former = self._is_outdated(scene)
-            model = "the model is older than its images: 'all' makes it anew" if former else "no model yet"
+            model = "the model is older than its images: 'all' updates it" if former else "no model yet"
             return f"snakesfm: scene '{scene.name}': {made}{model}."
         others = summary.get("images_in_other_models", [])
-        more = f" and {sum(others)} in {len(others)} models beside" if others else ""
+        more = f" and {sum(others)} in {len(others)} other models" if others else ""
         accuracy = ""
         with contextlib.suppress(OSError, ValueError, KeyError):
             metrics = json.loads((scene.folder / "evaluate_model" / "metrics.json").read_text("utf-8"))
@@ -265,9 +265,9 @@ def _describe_accuracy(metrics: dict[str, Any]) -> str:
     """A clause on how near a model is to its reference."""
     images, present = metrics["reference_images"], metrics["reference_images_present"]
     if not present:
-        return ", none of the reference's images is among them by name, so nothing is evaluated"
+        return ", no image name occurs in the reference, so nothing is evaluated"
     areas = [f"{metrics[f'relative_pose_auc_{degrees}deg']:.1f}" for degrees in (1, 3, 5)]
-    share = f" of the reference's {images} images, {present} of which are here" if present < images else ""
+    share = f" over the reference's {images} images, {present} of them here" if present < images else ""
     return f", relative-pose AUC {'/'.join(areas)} at 1/3/5 deg{share}"
 
 

@@ -1,4 +1,4 @@
-"""What is refused before a scene's first job: paths that are not there, or whose files do not serve."""
+"""Checks before a scene's first job: paths that do not exist, or whose files cannot be used."""
 
 from pathlib import Path
 
@@ -10,11 +10,11 @@ from snakesfm.scene_plan import ScenePlan
 
 
 def check_scene(scene: ScenePlan) -> None:
-    """Refuse paths that are not there, or whose files do not serve.
+    """Refuse paths that do not exist, or whose files cannot be used.
 
     Raises
     ------
-    ConfigError : says which and what to do.
+    ConfigError : names the path and the remedy.
     """
     _check_images(scene)
     _check_given_files(scene)
@@ -23,8 +23,8 @@ def check_scene(scene: ScenePlan) -> None:
     models = [model for stage in STAGES for model in scene.models(stage)]
     if len(models) > 1 and scene.weights.is_file():
         raise ConfigError(
-            f"weights={scene.weights} is one file, but scene '{scene.name}' needs those of "
-            f"{len(models)} networks ({', '.join(models)}): give a folder that holds them all."
+            f"weights={scene.weights} is a single file, but scene '{scene.name}' needs the weights of "
+            f"{len(models)} networks ({', '.join(models)}): give a folder that contains them all."
         )
 
 
@@ -33,47 +33,47 @@ def _check_images(scene: ScenePlan) -> None:
     if not images.is_dir():
         hint = "make it with 'make demo', or " if scene.inputs.images == "demo/images" else ""
         raise ConfigError(
-            f"The image folder '{images}' does not exist: {hint}say which folder with "
-            "--config images=PATH (name a path with ' #' in it in a file for --configfile: "
-            "Snakemake cuts it there)."
+            f"The image folder '{images}' does not exist: {hint}choose the folder with "
+            "--config images=PATH (if the path contains ' #', where Snakemake cuts it, set it in a file "
+            "for --configfile)."
         )
     if scene.folder.resolve() == images.resolve():
         raise ConfigError(
-            f"Scene '{scene.name}' would be written into its own image folder '{images}': give it another "
-            "scene=NAME or another output=DIR."
+            f"Scene '{scene.name}' would be written into its own image folder '{images}': choose another "
+            "scene=NAME or output=DIR."
         )
     if scene.folder.resolve().is_relative_to(images.resolve()):
         raise ConfigError(
-            f"The output folder '{scene.folder.parent}' lies inside the image folder '{images}', so its "
-            "pictures would be taken for photographs: give another output=DIR."
+            f"The output folder '{scene.folder.parent}' is inside the image folder '{images}', so its "
+            "pictures would be treated as photographs: choose another output=DIR."
         )
     if count_images(images, 1) == 0:
         _, unread = list_photographs(images)
         remedy = (
-            f"convert those like '{unread[0]}' to JPEG ({len(unread)} in number)."
+            f"convert files such as '{unread[0]}' to JPEG ({len(unread)} files)."
             if unread
-            else "say with --config images=PATH which folder does."
+            else "choose another one with --config images=PATH."
         )
-        raise ConfigError(f"The folder '{images}' holds no JPEG, PNG, TIFF, WebP or BMP image: {remedy}")
+        raise ConfigError(f"The folder '{images}' contains no JPEG, PNG, TIFF, WebP or BMP image: {remedy}")
 
 
 def _check_given_files(scene: ScenePlan) -> None:
     if scene.configuration.select_pairs.method == "listed" and not scene.pairs_file:
         raise ConfigError(
-            f"select_pairs.method is 'listed', but scene '{scene.name}' has no list: "
-            "give it with pairs=FILE."
+            f"select_pairs.method is 'listed', but scene '{scene.name}' has no list of pairs: "
+            "set pairs=FILE."
         )
     methods = (scene.method("extract_features"), scene.method("match_pairs"))
     oracle = next((name for name in methods if name in ("virtual", "virtual_places")), "")
     if oracle and not scene.inputs.reference:
         raise ConfigError(
-            f"The front-end '{oracle}' takes the points of a reference model, but scene '{scene.name}' "
-            "has none: give reference=PATH."
+            f"The front-end '{oracle}' needs the points of a reference model, but scene '{scene.name}' "
+            "has none: set reference=PATH."
         )
     if scene.method("extract_features") == "imported" and not scene.inputs.imported:
         raise ConfigError(
             f"The front-end 'imported' reads hloc's files, but scene '{scene.name}' names none: "
-            "give imported=DIR."
+            "set imported=DIR."
         )
     for key in ("reference", "cameras", "masks", "pairs", "imported"):
         path = getattr(scene.inputs, key)
@@ -84,13 +84,13 @@ def _check_given_files(scene: ScenePlan) -> None:
             )
     if scene.inputs.pairs and not Path(scene.inputs.pairs).expanduser().is_file():
         raise ConfigError(
-            f"'{scene.inputs.pairs}', given as pairs= for scene '{scene.name}', is no file: "
-            "name the text file with two image names per line."
+            f"'{scene.inputs.pairs}', given as pairs= for scene '{scene.name}', is not a file: "
+            "give a text file with two image names per line."
         )
     if scene.inputs.imported and not Path(scene.inputs.imported).expanduser().is_dir():
         raise ConfigError(
-            f"'{scene.inputs.imported}', given as imported= for scene '{scene.name}', is no folder: "
-            "name the folder that holds hloc's features.h5 and matches.h5."
+            f"'{scene.inputs.imported}', given as imported= for scene '{scene.name}', is not a folder: "
+            "give the folder that contains hloc's features.h5 and matches.h5."
         )
 
 
@@ -98,21 +98,21 @@ def _check_masks(scene: ScenePlan) -> None:
     masks = scene.masks
     if not masks.is_dir():
         raise ConfigError(
-            f"'{masks}', given as masks=, is no folder: give the folder that holds the masks."
+            f"'{masks}', given as masks=, is not a folder: give the folder that contains the masks."
         )
     if masks.resolve().is_relative_to(scene.images.resolve()):
         raise ConfigError(
-            f"The folder of masks '{masks}' lies inside the image folder '{scene.images}', so its files "
-            "would be taken for photographs: move it elsewhere."
+            f"The folder of masks '{masks}' is inside the image folder '{scene.images}', so its files "
+            "would be treated as photographs: move it elsewhere."
         )
     if scene.method("extract_features") == "imported" or scene.detector_free:
         raise ConfigError(
-            f"Scene '{scene.name}' has masks, but they do not reach matches that are imported or found "
-            "without keypoints: remove masks= or take another front_end."
+            f"Scene '{scene.name}' has masks, but these cannot be applied to matches that are imported or "
+            "found without keypoints: remove masks= or use another front_end."
         )
     # every job comes by here: with a mask for each image, the first one is enough
     if not any(find_mask(masks, image) for image in walk_images(scene.images)):
         raise ConfigError(
-            f"The folder of masks '{masks}' holds none for any image of scene '{scene.name}': the mask of "
-            "'a/b.jpg' is 'a/b.jpg.png' or 'a/b.png' in it."
+            f"The folder of masks '{masks}' contains no mask for any image of scene '{scene.name}': name "
+            "the mask of 'a/b.jpg' 'a/b.jpg.png' or 'a/b.png'."
         )

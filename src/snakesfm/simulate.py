@@ -48,7 +48,7 @@ class Simulation:
 
     def __init__(self, folder: Path, options: SimulationOptions) -> None:
         if folder.exists() and any(folder.iterdir()):
-            raise ConfigError(f"{folder} is not empty: name a new folder.")
+            raise ConfigError(f"{folder} is not empty: choose a new folder.")
         self.folder = folder.resolve()
         self.options = options
         self.scene = self.folder.name

@@ -70,7 +70,7 @@ def _patient_kind(kind: Any) -> Any:
                     yield job
                     continue
                 # Snakemake then looks for its output, and runs it again where that is missing
-                self.logger.warning(f"SLURM does not know job {job.external_jobid} any more.")
+                self.logger.warning(f"SLURM no longer knows job {job.external_jobid}.")
                 self.report_job_success(job)
 
         def is_forgotten(self, number: str) -> bool:
@@ -131,7 +131,7 @@ def end_jobs(run: str, output: str, lock: str) -> int:
         ended = False
     if not ended:
         raise ConfigError(
-            f"SLURM jobs of an interrupted run may still write to '{output}' and cannot be ended from "
-            f"here: type 'scancel --name={run}' where SLURM answers, delete {lock}, and run again."
+            f"SLURM jobs of an interrupted run may still write to '{output}' and cannot be cancelled from "
+            f"here: run 'scancel --name={run}' where SLURM answers, delete {lock}, and run again."
         )
     return len(jobs)

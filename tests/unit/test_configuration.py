@@ -45,7 +45,7 @@ from snakesfm.errors import ConfigError
         ({"extract_features": {"edge_threshold": 1.0}}, ["edge_threshold' = 1.0", "greater than 1."]),
         (
             {"adjust_bundle": {"refine_finenesses": [2.0, 1.0]}},
-            ["key 'adjust_bundle': refine_finenesses must ascend"],
+            ["key 'adjust_bundle': refine_finenesses must increase"],
         ),
         ({"adjust_bundle": {"thresholds_px": [5, 0]}}, ["thresholds_px' = 0: ", "greater than 0."]),
         ({"adjust_bundle": {"early_loss_share": 0}}, ["early_loss_share' = 0: ", "greater than 0."]),
@@ -94,7 +94,7 @@ def test_scenes_replace_images_and_both_are_refused() -> None:
     with pytest.raises(ConfigError, match="not both"):
         list_scenes(load_configuration({"scenes": scenes, "images": "z"}))
     for key, value in {"cameras": "K.txt", "intrinsics": "refine", "reference": "r", "pairs": "p"}.items():
-        with pytest.raises(ConfigError, match=f"'{key}' beside 'scenes' .* each scene"):
+        with pytest.raises(ConfigError, match=f"'{key}' next to 'scenes' .* each scene"):
             list_scenes(load_configuration({"scenes": scenes, key: value}))
 
 

@@ -130,7 +130,7 @@ def test_virtual_and_imported_ask_for_what_they_read(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="imported=DIR"):
         plan_of(tmp_path, front_end="imported")
     (tmp_path / "features.h5").write_bytes(b"features")
-    with pytest.raises(ConfigError, match=r"features\.h5', given as imported= .* is no folder"):
+    with pytest.raises(ConfigError, match=r"features\.h5', given as imported= .* is not a folder"):
         plan_of(tmp_path, front_end="imported", imported=str(tmp_path / "features.h5"))
     folder = tmp_path / "hloc"
     folder.mkdir()
@@ -242,11 +242,11 @@ def test_masks_reach_extraction_and_export_and_their_content_counts(tmp_path: Pa
     ("masks", "config", "reason"),
     [
         ("none", {}, "does not exist"),
-        ("scene/images", {}, "lies inside the image folder"),
-        ("empty", {}, r"holds none for any image of scene 'scene'.*a/b\.jpg\.png"),
-        ("file", {}, "is no folder"),
-        ("masks", {"front_end": "loftr"}, "take another front_end"),
-        ("masks", {"front_end": "imported"}, "take another front_end"),
+        ("scene/images", {}, "is inside the image folder"),
+        ("empty", {}, r"contains no mask for any image of scene 'scene'.*a/b\.jpg\.png"),
+        ("file", {}, "is not a folder"),
+        ("masks", {"front_end": "loftr"}, "use another front_end"),
+        ("masks", {"front_end": "imported"}, "use another front_end"),
     ],
 )
 def test_masks_that_would_do_nothing_are_refused(
@@ -282,7 +282,7 @@ def test_one_file_of_weights_serves_one_network(tmp_path: Path) -> None:
     file.write_bytes(b"other")
     (scene,) = plan_of(tmp_path, front_end="loftr", weights=str(file)).scenes.values()
     assert first != scene.params("match_pairs", {"tile": "0-0"}, True)
-    with pytest.raises(ConfigError, match=r"needs those of 2 networks .*give a folder"):
+    with pytest.raises(ConfigError, match=r"needs the weights of 2 networks .*give a folder"):
         plan_of(tmp_path, front_end="xfeat+lighterglue", weights=str(file))
 
 

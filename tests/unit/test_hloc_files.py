@@ -94,9 +94,9 @@ def test_files_that_do_not_fit_together_are_refused(tmp_path, columns):
         file["a.jpg"]["scores"] = np.ones(3)
         write_hloc_matches(file, ("a.jpg", "b.jpg"), np.array([[0, 9]]), np.ones(1), 5)
     file = open_hloc(tmp_path / "bad.h5")
-    with pytest.raises(ConfigError, match=r"7 keypoints of 'a\.jpg'"):
+    with pytest.raises(ConfigError, match=r"7 keypoints for 'a\.jpg'"):
         read_hloc_features(file, "a.jpg")
-    with pytest.raises(ConfigError, match="one run of hloc"):
+    with pytest.raises(ConfigError, match="the same run of hloc"):
         read_hloc_matches(file, ("a.jpg", "b.jpg"), (5, 9))
     with pytest.raises(ConfigError, match="imported=DIR"):
         open_hloc(tmp_path / "missing.h5")
@@ -131,7 +131,7 @@ def test_keypoints_may_have_the_columns_of_colmap(tmp_path):
 @pytest.mark.parametrize("shape", [(6,), (1, 3, 2), (5, 1), (2, 7)])
 def test_keypoints_that_are_no_rows_of_coordinates_are_refused(tmp_path, shape):
     file = write(tmp_path / "f.h5", "a.jpg", keypoints=np.zeros(shape))
-    with pytest.raises(ConfigError, match=r"keypoints of 'a\.jpg' of shape .*, which are no rows"):
+    with pytest.raises(ConfigError, match=r"keypoints of shape .* for 'a\.jpg', which are not rows"):
         read_hloc_features(file, "a.jpg")
 
 
@@ -150,7 +150,7 @@ def test_an_image_without_keypoints_is_read_whatever_shape_its_descriptors_have(
 @pytest.mark.parametrize("shape", [(3,), (3, 16), (16, 0), (1, 16, 3)])
 def test_descriptors_that_are_not_one_per_keypoint_are_refused(tmp_path, shape):
     file = write(tmp_path / "f.h5", "a.jpg", keypoints=np.zeros((3, 2)), descriptors=np.zeros(shape))
-    with pytest.raises(ConfigError, match=r"3 keypoints of 'a\.jpg', but not as many descriptors"):
+    with pytest.raises(ConfigError, match=r"3 keypoints for 'a\.jpg', but another number of descriptors"):
         read_hloc_features(file, "a.jpg")
 
 
@@ -161,7 +161,7 @@ def test_matches_with_a_leading_axis_are_read_and_too_few_scores_refused(tmp_pat
     file = write(path, "a.jpg/c.jpg", matches0=partners, matching_scores0=scores[:, :2])
     matches, values = read_hloc_matches(file, ("a.jpg", "b.jpg"), (3, 3))
     assert matches.tolist() == [[1, 2], [2, 0]] and values.tolist() == [0.5, 0.25]
-    with pytest.raises(ConfigError, match=r"3 matches0 of 'a\.jpg' and 'c\.jpg', but 2 matching_scores0"):
+    with pytest.raises(ConfigError, match=r"3 matches0 for 'a\.jpg' and 'c\.jpg', but 2 matching_scores0"):
         read_hloc_matches(file, ("a.jpg", "c.jpg"), (3, 3))
 
 

@@ -37,7 +37,7 @@ def texture(seed: int) -> Image.Image:
     ("config", "parts"),
     [
         (["images=nowhere"], ["nowhere", "does not exist", "images=PATH"]),
-        (["images=empty"], ["empty", "holds no"]),
+        (["images=empty"], ["empty", "contains no"]),
         (["images=empty", "imagse=x"], ["imagse", "did you mean 'images'"]),
         (["images=empty", "match_pairs={max_ratioo: 1}"], ["match_pairs.max_ratioo", "max_ratio"]),
         (["images=empty", "blocks=0"], ["blocks"]),
@@ -46,9 +46,9 @@ def texture(seed: int) -> Image.Image:
         (["images=photos", "output=photos/out"], ["photos/out", "inside the image folder"]),
         (["images=photos", "scene=a/b"], ["a/b", "scene=NAME"]),
         (["images=photos", "output=."], ["its own image folder 'photos'", "scene=NAME"]),
-        (["images=100_0042"], ["images=100_0042 for the number 1000042", "images=./100_0042"]),
+        (["images=100_0042"], ["images=100_0042 as the number 1000042", "images=./100_0042"]),
         (["images=photos", "select_pairs={method: listed}"], ["pairs="]),
-        (["images=photos", "select_pairs={method: listed}", "pairs=empty"], ["empty", "is no file"]),
+        (["images=photos", "select_pairs={method: listed}", "pairs=empty"], ["empty", "is not a file"]),
     ],
 )
 def test_a_wrong_call_gives_one_sentence(
@@ -72,7 +72,7 @@ def test_a_quiet_call_gives_its_sentence_too(workflow) -> None:
     outcome = workflow.run("--quiet", "all", "--config", "output=out", "images=telephone")
     assert outcome.status != 0
     assert "Traceback" not in outcome.text
-    assert outcome.text.count("convert those like 'IMG_1.HEIC' to JPEG (1 in number)") == 1
+    assert outcome.text.count("convert files such as 'IMG_1.HEIC' to JPEG (1 files)") == 1
 
 
 def test_one_image_is_too_few(workflow, small_scene: Path) -> None:
@@ -142,7 +142,7 @@ def test_names_and_files_of_all_kinds(workflow, small_scene: Path) -> None:
     assert summary["images"] == 14
     # the twin is left out, as the report says
     assert summary["not_registered"] == ["twin of brace.jpg"]
-    assert any("1 images are copies of others" in line for line in outcome.summary)
+    assert any("1 images are exact copies of others" in line for line in outcome.summary)
     log = (scene / "logs" / "index_images" / "job.log").read_text()
     assert "png.NEF" not in log
     assert any("warning: 4 image files could not be used" in line for line in outcome.summary)
@@ -153,7 +153,7 @@ def test_names_and_files_of_all_kinds(workflow, small_scene: Path) -> None:
         assert (scene / "export_model" / frame["file_path"]).is_file()
     report = (scene / "render_report" / "index.html").read_text()
     assert "truncated.jpg" in report
-    assert "which stands for it" in report
+    assert "which is used instead" in report
 
 
 def test_two_groups_that_do_not_meet_give_the_larger_one(workflow, small_scene: Path) -> None:

@@ -203,7 +203,7 @@ def test_places_found_pair_by_pair_are_merged(
     assert before[2] > 0.99 * before.sum() > 1000
     assert after[2] < 0.3 * after.sum() and after @ np.arange(len(after)) > 3.5 * after.sum()
     page = (out / "render_report" / "index.html").read_text("utf-8")
-    assert "inlier matches joined as they were found" in page and "in merged keypoints" in page
+    assert "inlier matches before merging keypoints" in page and "after merging" in page
 
     # other blocks and other pairs' places stay what they were
     (tmp_path / "blocks").mkdir()

@@ -161,7 +161,7 @@ def test_a_folder_without_records_is_taken_over_unless_its_options_differ(
     assert workflow.run("--dry-run", *other).status == 0 and model_bytes(output) == before
     changed = workflow.run(*other)
     assert changed.status == 0, changed.text
-    assert "1 files of which this folder's .snakemake knows nothing" in changed.text
+    assert "1 files without a record in this folder's .snakemake" in changed.text
     assert {"build_tracks", "triangulate_tracks", "adjust_bundle", "export_model"} <= set(changed.rules)
     assert not {"extract_features", "match_pairs", "average_rotations"} & set(changed.rules)
     assert (output / "build_tracks" / "tracks.h5.refused").is_file()

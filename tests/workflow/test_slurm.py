@@ -218,7 +218,7 @@ def test_a_run_goes_on_when_slurm_is_back(
     cluster.start_controller()
     text, _ = run.communicate(timeout=300)
     assert run.returncode == 0, text
-    assert not forgets or re.search(r"SLURM does not know job \d+ any more", text)
+    assert not forgets or re.search(r"SLURM no longer knows job \d+", text)
     assert (output / "render_report" / "index.html").is_file()
     assert model_bytes(output) == model_bytes(finished[0])
 

@@ -164,7 +164,7 @@ class Artifact:
             raise ArtifactError(f"{path} is missing: run snakemake again to make it.") from None
         except OSError:
             raise ArtifactError(
-                f"{path} is damaged or no HDF5 file: delete it and run snakemake again."
+                f"{path} is damaged or not an HDF5 file: delete it and run snakemake again."
             ) from None
         kind, version = file.attrs.get("artifact"), file.attrs.get("format_version")
         if kind != cls.kind or version != cls.format_version:

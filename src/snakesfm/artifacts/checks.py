@@ -85,7 +85,7 @@ def _raise_for(refused: list[str]) -> None:
     if refused:
         more = f" (and {len(refused) - 1} more)" if len(refused) > 1 else ""
         raise ArtifactError(
-            f"{refused[0]}{more}: it was renamed to *{ASIDE}; start the same command again to make it anew."
+            f"{refused[0]}{more}: it was renamed to *{ASIDE}; start the same command again to recreate it."
         )
 
 

@@ -1,4 +1,4 @@
-"""Columns of artifacts that are spread over the files of all blocks or tiles."""
+"""Columns of artifacts collected from the files of all blocks or tiles."""
 
 from collections.abc import Collection, Iterable, Sequence
 from pathlib import Path

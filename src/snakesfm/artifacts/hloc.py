@@ -41,7 +41,7 @@ def open_hloc(path: Path) -> h5py.File:
         return h5py.File(path, "r", locking=False)
     except OSError:
         raise ConfigError(
-            f"{path} is missing or no HDF5 file: give imported=DIR of a folder with hloc's features as "
+            f"{path} is missing or not an HDF5 file: set imported=DIR to a folder with hloc's features as "
             f"{FEATURES}, its matches as {MATCHES} and its list of pairs as {PAIRS}."
         ) from None
 
@@ -71,8 +71,8 @@ def read_hloc_features(file: h5py.File, name: str) -> dict[str, Array] | None:
         rows = np.zeros((0, 2), np.float32)
     if rows.ndim != 2 or not 2 <= rows.shape[1] <= MOST_COLUMNS:
         raise ConfigError(
-            f"{file.filename} has keypoints of '{name}' of shape {rows.shape}, which are no rows of x and "
-            "y: write it again with hloc."
+            f"{file.filename} has keypoints of shape {rows.shape} for '{name}', which are not rows of "
+            "x and y: write it again with hloc."
         )
     count = len(rows)
     none = np.zeros((0, count))
@@ -93,8 +93,8 @@ def read_hloc_features(file: h5py.File, name: str) -> dict[str, Array] | None:
     }
     if descriptors.ndim != 2 or any(len(column) != count for column in found.values()):
         raise ConfigError(
-            f"{file.filename} has {count} keypoints of '{name}', but not as many descriptors or scores: "
-            "write it again with hloc."
+            f"{file.filename} has {count} keypoints for '{name}', but another number of descriptors or "
+            "scores: write it again with hloc."
         )
     return found
 
@@ -112,8 +112,8 @@ def read_hloc_size(file: h5py.File, name: str) -> tuple[int, int] | None:
     told = np.ravel(group["image_size"][()])
     if len(told) != 2 or not (told >= 1).all():
         raise ConfigError(
-            f"{file.filename} has an image_size of '{name}' that is no width and height: write it again "
-            "with hloc."
+            f"{file.filename} has an image_size for '{name}' that is not a width and a height: write it "
+            "again with hloc."
         )
     return int(told[0]), int(told[1])
 
@@ -209,7 +209,7 @@ def read_hloc_matches(
                 scores = _optional(group, "matching_scores0", np.ones(len(partners))).ravel()
                 if len(scores) != len(partners):
                     raise ConfigError(
-                        f"{file.filename} has {len(partners)} matches0 of '{names[0]}' and '{names[1]}', "
+                        f"{file.filename} has {len(partners)} matches0 for '{names[0]}' and '{names[1]}', "
                         f"but {len(scores)} matching_scores0: write it again with hloc."
                     )
                 rows = np.flatnonzero(partners != UNMATCHED)
@@ -221,7 +221,7 @@ def read_hloc_matches(
                 if len(pairs) and (pairs.min() < 0 or (pairs.max(axis=0) >= counts).any()):
                     raise ConfigError(
                         f"{file.filename} matches keypoints of '{names[0]}' and '{names[1]}' that "
-                        f"{FEATURES} does not have: give features and matches of one run of hloc."
+                        f"{FEATURES} does not have: use features and matches from the same run of hloc."
                     )
                 return pairs.astype(np.int32), values
     return None

@@ -16,7 +16,7 @@ class ImageIndex(Artifact):
     names: Array = column("(N)", "str", "POSIX path relative to the image folder, sorted")
     sizes: Array = column("(N,2)", "int32", "width and height in pixels as stored in the file")
     sha256: Array = column("(N)", "str", "SHA-256 of the file, hexadecimal")
-    blocks: Array = column("(N)", "int32", "block that the image is dealt into")
+    blocks: Array = column("(N)", "int32", "block that the image belongs to")
     camera_ids: Array = column("(N)", "int32", "row of the image's camera in the camera columns")
     orientations: Array = column("(N)", "int32", "EXIF orientation 1..8, not applied: pixels are as stored")
     focal_exif_px: Array = column(
@@ -30,7 +30,7 @@ class ImageIndex(Artifact):
     camera_sources: Array = column("(C)", "str", "where the focal length is from: given, exif, default")
     refused_names: Array = column("(R)", "str", "files that look like images but cannot be used")
     refused_reasons: Array = column("(R)", "str", "one sentence per refused file")
-    warnings: Array = column("(W)", "str", "one sentence for all else that is doubtful")
+    warnings: Array = column("(W)", "str", "one sentence for each other problem found")
 
 
 @dataclass(frozen=True)
@@ -44,5 +44,7 @@ class CalibratedCameras(Artifact):
     sizes: Array = column("(C,2)", "int32", "width and height in pixels")
     params: Array = column("(C,16)", "float64", "COLMAP parameters in pixels, padded with NaN")
     sources: Array = column("(C)", "str", "where the focal length is from: given, exif, estimated, default")
-    focal_sigma: Array = column("(C)", "float64", "relative standard deviation of the focal, NaN unknown")
+    focal_sigma: Array = column(
+        "(C)", "float64", "relative standard deviation of the focal length, NaN if unknown"
+    )
     pair_counts: Array = column("(C)", "int32", "pairs whose fundamental matrix voted on the focal")

@@ -18,7 +18,9 @@ class CameraRotations(Artifact):
     rotations: Array = column("(N,3,3)", "float64", "cam_from_world; NaN where the image has none")
     residuals_deg: Array = column("(E)", "float64", "per edge of the view graph, NaN where not compared")
     labels: Array = column("(E)", "int8", "label of the edge after averaging, as in view_graph")
-    components: Array = column("(N)", "int32", "images of one share a world; 0 the largest, -1 none")
+    components: Array = column(
+        "(N)", "int32", "images of one component share a coordinate frame; 0 the largest, -1 none"
+    )
 
 
 @dataclass(frozen=True)
@@ -31,13 +33,16 @@ class TrackTable(Artifact):
     offsets: Array = column("(T+1)", "int64", "rows offsets[k]:offsets[k+1] belong to track k")
     image_ids: Array = column("(L)", "int32", "row of the image in the index")
     keypoint_ids: Array = column("(L)", "int32", "row of the keypoint in its image")
-    part_ids: Array = column("(L)", "int32", "part of a track that hangs together by confirmed matches")
+    part_ids: Array = column("(L)", "int32", "part of a track that is connected by confirmed matches")
     keypoints: Array = column("(L,2)", "float32", "x, y in original pixels")
     colors: Array = column("(L,3)", "uint8", "RGB of the image at the keypoint")
     lengths_unmerged: Array = column(
-        "(U)", "int64", "detector-free: joined inlier matches as found, entry k: in k images; else empty"
+        "(U)",
+        "int64",
+        "detector-free: entry k is the number of tracks in k images if inlier matches are joined before "
+        "merging; else empty",
     )
-    lengths_merged: Array = column("(V)", "int64", "the same matches in merged keypoints, before splitting")
+    lengths_merged: Array = column("(V)", "int64", "the same in merged keypoints, before splitting")
 
 
 @dataclass(frozen=True)
@@ -78,11 +83,13 @@ class Reconstruction(Artifact):
     camera_sizes: Array = column("(C,2)", "int32", "width and height in pixels")
     camera_params: Array = column("(C,16)", "float64", "COLMAP parameters in pixels, padded with NaN")
     camera_resets: Array = column(
-        "(C)", "str", "what was not plausible of a camera that the last pass reset and held; else empty"
+        "(C)", "str", "implausible parameter for which the last pass reset and fixed the camera; else empty"
     )
     rotations: Array = column("(N,3,3)", "float64", "cam_from_world; NaN where not registered")
     translations: Array = column("(N,3)", "float64", "cam_from_world; NaN where not registered")
-    models: Array = column("(N)", "int32", "images of one share a world; 0 the largest, -1 none")
+    models: Array = column(
+        "(N)", "int32", "images of one model share a coordinate frame; 0 the largest, -1 none"
+    )
     points: Array = column("(T,3)", "float64", "point in the world")
     colors: Array = column("(T,3)", "uint8", "mean RGB of the observations")
     errors_px: Array = column("(T)", "float64", "mean reprojection error of the point")
@@ -99,7 +106,7 @@ class Reconstruction(Artifact):
 
     @property
     def model_count(self) -> int:
-        """How many models there are, each in a world of its own."""
+        """How many models there are, each in its own coordinate frame."""
         return int(self.models.max(initial=-1)) + 1
 
     def select_model(self, number: int) -> "Reconstruction":

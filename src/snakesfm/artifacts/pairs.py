@@ -38,7 +38,12 @@ class ImagePairs(Artifact):
         "(P)", "str", "why: exhaustive, sequential, retrieved, listed, spatial; joined by +"
     )
     similarities: Array = column("(P)", "float32", "global similarity, NaN where not computed")
-    likenesses: Array = column("(P)", "float32", "of the largest keypoints, NaN where not looked at")
+    likenesses: Array = column(
+        "(P)",
+        "float32",
+        "preview score: sum of (1 - distance ratio)^2 over mutual nearest neighbours of the largest "
+        "keypoints; NaN if not previewed",
+    )
 
 
 @dataclass(frozen=True)
@@ -56,7 +61,7 @@ class PairMatches(Artifact):
 
 @dataclass(frozen=True)
 class PairCoordinates(Artifact):
-    """Places that match in the pairs of one tile, as found without keypoints."""
+    """Matched positions of the pairs of one tile, as found without keypoints."""
 
     kind: ClassVar[str] = "pair_coordinates"
 
@@ -69,7 +74,7 @@ class PairCoordinates(Artifact):
 
 @dataclass(frozen=True)
 class TwoViewGeometries(Artifact):
-    """Relative pose, its covariance and the inlier matches of the pairs of one tile (or scene)."""
+    """Relative poses, their covariances and the inlier matches of the pairs of one tile (or scene)."""
 
     kind: ClassVar[str] = "two_view_geometries"
 
@@ -83,7 +88,7 @@ class TwoViewGeometries(Artifact):
         "covariance (rad) of the left rotation increment (3) and of the translation's two tangents",
     )
     kinds: Array = column("(P)", "int8", "0 general, 1 planar, 2 rotation-only")
-    rejections: Array = column("(P)", "int8", "0 accepted, else index of the reason why not")
+    rejections: Array = column("(P)", "int8", "0 accepted, else index of the reason for rejection")
     match_counts: Array = column("(P)", "int32", "matches between distinct places whose rays are finite")
     inlier_counts: Array = column("(P)", "int32", "inlier matches")
     inlier_ratios: Array = column("(P)", "float64", "share of the matches that are inliers, see ratio_of")
@@ -106,6 +111,6 @@ class ViewGraph(Artifact):
     inlier_counts: Array = column("(E)", "int32", "inlier matches")
     triangulation_angles_deg: Array = column("(E)", "float64", "median angle between the inliers' rays")
     labels: Array = column("(E)", "int8", "0 kept, else index of the filter that refused the edge")
-    cycle_min_deg: Array = column("(E)", "float64", "smallest 3-cycle error of the edge, NaN in no cycle")
-    cycle_median_deg: Array = column("(E)", "float64", "median 3-cycle error of the edge, NaN in no cycle")
+    cycle_min_deg: Array = column("(E)", "float64", "smallest 3-cycle error of the edge, NaN if in none")
+    cycle_median_deg: Array = column("(E)", "float64", "median 3-cycle error of the edge, NaN if in none")
     components: Array = column("(N)", "int32", "component of each image by kept edges, 0 the largest")

@@ -16,13 +16,16 @@ class AverageRotationsOptions(StageOptions):
     """Averager: robust pass and covariance-weighted refinement, L1 and IRLS only, or Shonan averaging."""
 
     max_residual_deg: float = Field(default=10.0, gt=0, le=180)
-    """Edges are refused that differ from the averaged rotations by more degrees than this."""
+    """Edges that differ from the averaged rotations by more than a limit are refused; it adapts to the
+    scene, up to this value in degrees."""
 
     min_residual_deg: float = Field(default=5.0, ge=0, le=180)
-    """The limit adapts to the residuals of the scene, but not below so many degrees."""
+    """Lower bound of that limit, in degrees."""
 
     passes: int = Field(default=2, ge=1, le=5)
-    """How often the rotations are averaged; then edges are refused or taken back by residuals."""
+    """Number of times the rotations are averaged; after each, edges are refused or accepted again by
+    their residuals."""
 
     min_component_images: int = Field(default=5, ge=3)
-    """Images, three or more, that a part of the graph needs to be a model of its own beside the largest."""
+    """Smallest number of images (at least 3) for which a component besides the largest becomes a model
+    of its own."""

@@ -13,49 +13,51 @@ class AverageTranslationsOptions(StageOptions):
     stage_version: ClassVar[int] = 9
 
     method: Literal["scale_chain", "translation_recovery", "global_positioning"] = "scale_chain"
-    """First guess: baselines compared by landmarks, gtsam's recovery, or pycolmap's global positioning."""
+    """Initial positions: from baseline ratios of shared landmarks, gtsam's TranslationRecovery, or
+    pycolmap's global positioning."""
 
     refine: bool = True
-    """Adjust centres and landmarks to the angles of the rays after the first guess."""
+    """Then refine camera centres and landmarks by the angular errors of the rays."""
 
     rays_per_camera: int = Field(default=100, ge=0)
-    """Tracks are taken, the longest first, until each camera has about so many rays."""
+    """Tracks are used, the longest first, until each camera has about this many rays."""
 
     recovery_rays_per_camera: int = Field(default=12, ge=0)
-    """The same for translation_recovery, which slows down with the number of landmarks."""
+    """Same for translation_recovery, which slows down with the number of landmarks."""
 
     ray_sigma_deg: float = Field(default=0.3, gt=0, le=10)
-    """Expected error of a ray, mostly that of its camera's averaged rotation."""
+    """Expected error of a ray in degrees, mostly from its camera's averaged rotation."""
 
     edge_weight: float = Field(default=0.1, ge=0, le=1e6)
-    """Weight of a two-view direction against that of a ray when the angles are refined."""
+    """Weight of a two-view direction relative to that of a ray in the refinement."""
 
     reject_outliers: Literal["mfas", "residual", "none"] = "residual"
-    """How translation_recovery refuses edges: MFAS of 1DSfM, or a first solution's residuals."""
+    """How translation_recovery rejects edges: MFAS of 1DSfM, by the residuals of a first solution, or
+    not at all."""
 
     mfas_projections: int = Field(default=100, ge=1)
-    """One-dimensional projections of MFAS."""
+    """Number of one-dimensional projections in MFAS."""
 
     mfas_weight: float = Field(default=0.125, ge=0, le=1)
-    """MFAS refuses directions that are inconsistent in a larger share of the projections."""
+    """MFAS rejects directions that are inconsistent in a larger share of the projections."""
 
     recovery_sigma: float = Field(default=0.01, gt=0)
-    """Standard deviation of a direction, as a chord, in translation_recovery."""
+    """Standard deviation of a direction, as a chord length, in translation_recovery."""
 
     positioning_loss_scale: float = Field(default=0.01, gt=0)
     """Scale of the Huber loss of global_positioning."""
 
     positioning_start: Literal["random", "chain"] = "random"
-    """Where global_positioning begins: anywhere, as in GLOMAP, or at the result of scale_chain."""
+    """Start of global_positioning: random positions, as in GLOMAP, or the result of scale_chain."""
 
     max_edge_residual_deg: float = Field(default=5.0, gt=0, le=180)
-    """Two-view directions that differ from the centres by more degrees are not counted as used."""
+    """Two-view directions that differ from the estimated centres by more degrees do not count as used."""
 
     min_support: int = Field(default=6, ge=1)
-    """A camera keeps its centre when so many of its rays meet their landmarks."""
+    """A camera keeps its position if at least this many of its rays agree with their landmarks."""
 
     min_support_ratio: float = Field(default=0.5, ge=0, le=1)
-    """A camera keeps its centre when such a share of its rays meet their landmarks."""
+    """A camera keeps its position if at least this share of its rays agree with their landmarks."""
 
     max_relative_sigma: float = Field(default=0.1, gt=0)
-    """Largest standard deviation of a centre, relative to the median distance to the camera's landmarks."""
+    """Largest standard deviation of a camera centre, relative to the median distance to its landmarks."""

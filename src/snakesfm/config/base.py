@@ -1,4 +1,4 @@
-"""What all options models share."""
+"""Base class of all options models."""
 
 import json
 from typing import ClassVar, Self
@@ -7,7 +7,7 @@ from pydantic import BaseModel, ConfigDict
 
 
 class StageOptions(BaseModel):
-    """Options of one stage: frozen, typed, and nothing unknown passes.
+    """Options of one stage: frozen and typed; unknown keys are refused.
 
     ``stage_version`` is bumped when the stage's results change for the same inputs and options; it is part
     of what Snakemake compares, so the stage and what depends on it run again.
@@ -22,5 +22,5 @@ class StageOptions(BaseModel):
         return json.dumps(self.model_dump(mode="json"), sort_keys=True)
 
     def resolved(self) -> Self:
-        """The options with 'auto' replaced where these options alone tell what it means."""
+        """The options with 'auto' replaced where these options alone determine what it means."""
         return self

@@ -13,13 +13,13 @@ class BuildTracksOptions(StageOptions):
     stage_version: ClassVar[int] = 6
 
     min_length: int = Field(default=3, ge=2)
-    """Images that a track must be seen in; 2 where only two images have a rotation."""
+    """Number of images that a track must be seen in; 2 if only two images have a rotation."""
 
     sparse_observations: int = Field(default=100, ge=0)
-    """An image with fewer observations of such tracks keeps its tracks of two images too."""
+    """An image with fewer observations of such tracks also keeps its tracks of two images."""
 
     merge_radius_px: float = Field(default=1.0, ge=0.0, le=20.0)
-    """Keypoints of one image nearer than this count as one observation of a track."""
+    """Keypoints of one image closer together than this count as one observation of a track."""
 
     split_conflicts: bool = False
-    """Split a track that sees an image twice at its weakest link; otherwise drop the track."""
+    """Split a track that sees an image twice at its weakest link; otherwise the track is dropped."""

@@ -13,37 +13,37 @@ class CalibrateCamerasOptions(StageOptions):
     stage_version: ClassVar[int] = 5
 
     estimate_focals: bool = True
-    """Estimate focal lengths that are not given from fundamental matrices; otherwise priors are kept."""
+    """Estimate unknown focal lengths from fundamental matrices; otherwise the priors are kept."""
 
     pairs_per_camera: int = Field(default=30, ge=1, le=1000)
-    """Upper bound of the image pairs that vote on the focal length of one camera."""
+    """Largest number of image pairs that vote on the focal length of a camera."""
 
     min_matches: int = Field(default=40, ge=8, le=10_000)
     """Pairs with fewer matches do not vote."""
 
     min_votes: int = Field(default=3, ge=1, le=100)
-    """Focal lengths in EXIF stay where fewer pairs vote; without EXIF one vote is enough."""
+    """A focal length from EXIF is kept if fewer pairs vote; without EXIF one vote is enough."""
 
     max_error_px: float = Field(default=1.0, gt=0, le=20)
-    """Epipolar error up to which a match supports a fundamental matrix."""
+    """Largest epipolar error of a match that supports a fundamental matrix."""
 
     planar_ratio: float = Field(default=0.8, gt=0, le=1)
-    """Pairs whose inliers one homography explains by this share do not vote."""
+    """Pairs do not vote if a single homography explains this share of their inliers."""
 
     min_focal_ratio: float = Field(default=0.4, gt=0, le=10)
-    """Smallest believable focal length over the larger image side."""
+    """Smallest plausible focal length, relative to the longer image side."""
 
     max_focal_ratio: float = Field(default=6.0, gt=0, le=100)
-    """Largest believable focal length over the larger image side."""
+    """Largest plausible focal length, relative to the longer image side."""
 
     systematic_sigma: float = Field(default=0.04, ge=0, le=1)
-    """Relative error of an estimate that no number of pairs takes away: distortion, principal point."""
+    """Relative error of an estimate that more pairs do not reduce: distortion, principal point."""
 
     max_sigma: float = Field(default=0.15, gt=0, le=10)
-    """Estimates with a larger relative standard deviation are not used; the prior is kept."""
+    """Estimates with a larger relative standard deviation are discarded, and the prior is kept."""
 
     exif_sigma: float = Field(default=0.03, gt=0, le=10)
-    """Relative standard deviation of focal lengths from EXIF, as a prior."""
+    """Relative standard deviation of a focal length from EXIF, as a prior."""
 
     default_sigma: float = Field(default=0.5, gt=0, le=10)
     """Relative standard deviation of the default focal length, as a prior."""
@@ -53,6 +53,6 @@ class CalibrateCamerasOptions(StageOptions):
         if self.min_focal_ratio >= self.max_focal_ratio:
             raise ValueError(
                 f"min_focal_ratio {self.min_focal_ratio:g} must be below max_focal_ratio "
-                f"{self.max_focal_ratio:g}: lower the one or raise the other"
+                f"{self.max_focal_ratio:g}: lower the first or raise the second"
             )
         return self

@@ -69,17 +69,18 @@ class SceneInputs(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     images: str
-    """Folder of photographs, searched at any depth."""
+    """Folder of photographs, searched with all its subfolders."""
     reference: str = ""
     """Folder of a COLMAP model to evaluate against; empty for none."""
     cameras: str = ""
     """Known intrinsics: a COLMAP cameras.txt (or its folder) or a 3x3 K.txt; empty for none."""
     intrinsics: Literal["fixed", "refine"] = "fixed"
-    """What bundle adjustment does with known intrinsics: keep them fixed, or refine them."""
+    """Whether bundle adjustment keeps known intrinsics fixed or refines them."""
     masks: str = ""
     """Folder of masks, black where no keypoints are wanted: 'a/b.jpg.png' for 'a/b.jpg'; empty for none."""
     pairs: str = ""
-    """File of image pairs, one 'name0 name1' a line, for select_pairs.method 'listed'; empty for none."""
+    """Text file of image pairs, one 'name0 name1' per line, for select_pairs.method 'listed'; empty for
+    none."""
     imported: str = ""
     """Folder with hloc's features.h5, matches.h5 and pairs.txt, for the front-end 'imported'."""
 
@@ -100,42 +101,45 @@ FrontEndName = Literal[
 
 
 class RunOptions(BaseModel):
-    """What is not the business of one stage alone."""
+    """Options of the whole run."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     images: str = "demo/images"
-    """Folder of photographs, searched at any depth; unused where `scenes` lists some."""
+    """Folder of photographs, searched with all its subfolders; unused if `scenes` lists any."""
     output: str = "results"
-    """Folder that gets one folder per scene."""
+    """Output folder; each scene gets a folder in it."""
     scene: str = ""
-    """Name of the scene; empty takes the image folder's name (its parent's where that is 'images')."""
+    """Name of the scene; empty uses the name of the image folder (or of its parent, if it is called
+    'images')."""
     reference: str = ""
     """Folder of a COLMAP model to evaluate against; empty for none."""
     cameras: str = ""
     """Known intrinsics: a COLMAP cameras.txt (or its folder) or a 3x3 K.txt; empty for none."""
     intrinsics: Literal["fixed", "refine"] = "fixed"
-    """What bundle adjustment does with known intrinsics: keep them fixed, or refine them."""
+    """Whether bundle adjustment keeps known intrinsics fixed or refines them."""
     masks: str = ""
     """Folder of masks, black where no keypoints are wanted: 'a/b.jpg.png' for 'a/b.jpg'; empty for none."""
     pairs: str = ""
-    """File of image pairs, one 'name0 name1' a line, for select_pairs.method 'listed'; empty for none."""
+    """Text file of image pairs, one 'name0 name1' per line, for select_pairs.method 'listed'; empty for
+    none."""
     imported: str = ""
     """Folder with hloc's features.h5, matches.h5 and pairs.txt, for the front-end 'imported'."""
     front_end: FrontEndName = ""
-    """Detector and matcher by one name; empty takes the methods of extract_features and match_pairs."""
+    """Detector and matcher by one name; empty uses the methods set in extract_features and match_pairs."""
     weights: str = "weights"
-    """Folder (or one file) of weights, filled by 'snakemake fetch_weights'; jobs never download."""
+    """Folder (or one file) of network weights, filled by 'snakemake fetch_weights'; jobs never download."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
-    """Where networks run: on a CUDA device if there is one, on the processor, or on CUDA or not at all."""
+    """Device for networks: 'auto' uses CUDA if available, 'cpu' never does, 'cuda' fails without it."""
     batch_size: Annotated[int, Field(ge=1, le=256)] | Literal["auto"] = "auto"
-    """Images or pairs that a network gets at once; 'auto': 1 on the processor, 4 on CUDA."""
+    """Number of images or pairs passed to a network at once; 'auto' is 1 on the CPU, 4 on CUDA."""
     scenes: dict[str, SceneInputs] = Field(default_factory=dict)
     """Several scenes: a mapping from name to images, reference, cameras, intrinsics, masks and pairs."""
     seed: int = Field(default=0, ge=0)
     """Seed of every random draw; the same seed gives the same model."""
     blocks: Annotated[int, Field(ge=1)] | Literal["auto"] = "auto"
-    """Blocks that the images are dealt into; B blocks give B(B+1)/2 tiles of pairs, the unit of work."""
+    """Number of blocks the images are split into; B blocks give B(B+1)/2 tiles of pairs, one job each.
+    'auto' depends on the number of images."""
 
     @model_validator(mode="before")
     @classmethod
@@ -167,8 +171,8 @@ def check_spelling(values: Mapping[str, Any], arguments: Sequence[str]) -> None:
     for key in TEXT_KEYS:
         typed = [text.partition("=")[2] for text in arguments if text.startswith(f"{key}=")]
         if typed and _is_number(values.get(key)) and typed[-1] != str(values[key]):
-            remedy = f"write {key}=./{typed[-1]}" if key != "scene" else "give it another name"
-            raise ConfigError(f"Snakemake takes {key}={typed[-1]} for the number {values[key]}: {remedy}.")
+            remedy = f"write {key}=./{typed[-1]}" if key != "scene" else "choose another name"
+            raise ConfigError(f"Snakemake reads {key}={typed[-1]} as the number {values[key]}: {remedy}.")
 
 
 def _is_number(value: Any) -> bool:
@@ -252,9 +256,9 @@ def _refuse_beside_scenes(configuration: RunOptions) -> None:
         if getattr(configuration, key) == RunOptions.model_fields[key].default:
             continue
         if key in ("images", "scene"):
-            raise ConfigError(f"Give either '{key}' or 'scenes', not both: remove one of the two keys.")
+            raise ConfigError(f"Set either '{key}' or 'scenes', not both: remove one of the two keys.")
         raise ConfigError(
-            f"'{key}' beside 'scenes' belongs to none of them: write it into each scene that it is for."
+            f"'{key}' next to 'scenes' applies to none of them: move it into each scene that needs it."
         )
 
 
@@ -273,12 +277,12 @@ def list_scenes(configuration: RunOptions) -> dict[str, SceneInputs]:
         _refuse_beside_scenes(configuration)
     if re.search("[{}]", configuration.output):
         raise ConfigError(
-            f"The output folder '{configuration.output}' holds braces: give another output=DIR."
+            f"The output folder '{configuration.output}' contains braces: choose another with output=DIR."
         )
     for name in scenes:
         if not re.fullmatch(SCENE_PATTERN, name):
             raise ConfigError(
-                f"'{name}' cannot be the name of a scene: give scene=NAME, a name that holds no '/' and no "
-                "braces and does not start with a dot."
+                f"'{name}' cannot be the name of a scene: set scene=NAME to a name without '/' or braces "
+                "that does not start with a dot."
             )
     return scenes

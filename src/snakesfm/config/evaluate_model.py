@@ -10,7 +10,7 @@ Degrees = Annotated[float, Field(gt=0.0, le=180.0)]
 
 
 class EvaluateModelOptions(StageOptions):
-    """Which thresholds the metrics use."""
+    """Thresholds of the metrics."""
 
     stage_version: ClassVar[int] = 4
 
@@ -21,4 +21,5 @@ class EvaluateModelOptions(StageOptions):
     """Thresholds of the AUC over the poses of all reference images after alignment, in degrees."""
 
     min_baseline_ratio: float = Field(1e-6, ge=0.0, le=1.0)
-    """Reference images closer together than this share of the reference's extent have no direction."""
+    """Reference images closer together than this share of the reference's extent are compared by
+    rotation only."""

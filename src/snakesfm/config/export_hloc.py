@@ -6,9 +6,9 @@ from snakesfm.config.base import StageOptions
 
 
 class ExportHlocOptions(StageOptions):
-    """Features and matches as hloc's files; made only by the target `hloc`."""
+    """Features and matches in hloc's file format; made only by the target `hloc`."""
 
     stage_version: ClassVar[int] = 2
 
     matches: Literal["inliers", "putative"] = "inliers"
-    """Which matches are written: those that fit the pair's relative pose, or all that were found."""
+    """Which matches are written: the inliers of the pair's relative pose, or all."""

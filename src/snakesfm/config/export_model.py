@@ -11,10 +11,10 @@ class ExportModelOptions(StageOptions):
     stage_version: ClassVar[int] = 5
 
     georeference: Literal["auto"] | bool = "auto"
-    """Move models to metres east, north and up by the GPS in EXIF; 'auto': where the two agree."""
+    """Transform models to metres east, north and up by the GPS in EXIF; 'auto' does so if the two agree."""
 
     link_images: bool = True
-    """Link the images beside the model, so that COLMAP and nerfstudio read the folder as it is."""
+    """Link the images next to the model, so that COLMAP and nerfstudio can read the folder directly."""
 
     undistort: bool = False
-    """Also write images, masks and model with PINHOLE cameras, in 'undistorted', for Inria's 3DGS."""
+    """Also write images, masks and a model with PINHOLE cameras to 'undistorted', for Inria's 3DGS."""

@@ -8,30 +8,30 @@ from snakesfm.config.base import StageOptions
 
 
 class FilterViewGraphOptions(StageOptions):
-    """Options of refusing edges of the view graph that contradict the others."""
+    """Refusal of view-graph edges that contradict the others."""
 
     stage_version: ClassVar[int] = 4
 
     method: Literal["message_passing", "cycles"] = "message_passing"
-    """How 3-cycles refuse edges: by message passing between them, or by the paper's two passes."""
+    """How edges are judged by 3-cycles: message passing between cycles, or the two passes below."""
 
     max_cycle_error_deg: float = Field(default=7.0, gt=0, le=180)
-    """Edges are refused whose cycle error in degrees is larger than this."""
+    """Edges with a larger cycle error, in degrees, are refused."""
 
     min_cycles_per_edge: float = Field(default=6.0, ge=0)
-    """Where edges are in fewer 3-cycles on average, message passing and vote refuse none."""
+    """Message passing and vote refuse no edges if edges are in fewer 3-cycles on average."""
 
     first_pass: Literal["min", "median", "none"] = "min"
-    """Error of an edge in the first pass of method cycles: that of its best or of its median 3-cycle."""
+    """Error of an edge in the first pass of method 'cycles': its smallest or its median 3-cycle error."""
 
     second_pass: Literal["min", "median", "none"] = "median"
-    """The same for the second pass, which sees only the survivors of the first."""
+    """Same for the second pass, which uses only edges kept by the first."""
 
     cluster_vote: bool = True
-    """Let all inlier matches vote on how groups of images that the cycles left apart are joined."""
+    """Let all inlier matches vote on how to connect groups of images that cycles do not connect."""
 
     min_cluster_inliers: int = Field(default=30, ge=0)
-    """Edges of fewer inliers only vote, even where cycles confirm them."""
+    """Edges with fewer inliers only vote, even if cycles confirm them."""
 
     vote_tolerance_deg: float = Field(default=10.0, gt=0, le=90)
-    """Votes on the rotation between two groups agree if they differ by at most so many degrees."""
+    """Votes on the rotation between two groups agree if they differ by at most this angle in degrees."""

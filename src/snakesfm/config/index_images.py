@@ -8,12 +8,13 @@ from snakesfm.config.base import StageOptions
 
 
 class IndexImagesOptions(StageOptions):
-    """How cameras are told from the images."""
+    """How images are assigned to cameras, and where intrinsics start."""
 
     stage_version: ClassVar[int] = 4
 
     camera_sharing: Literal["auto", "exif", "single", "per_folder", "per_image"] = "auto"
-    """Which images share a camera: alike in EXIF or, without it, in folder and size, or a fixed rule."""
+    """Which images share a camera: 'auto' compares EXIF or, without it, folder and size; the others are
+    fixed rules."""
 
     camera_model: Literal[
         "auto",
@@ -27,10 +28,11 @@ class IndexImagesOptions(StageOptions):
         "SIMPLE_RADIAL_FISHEYE",
         "RADIAL_FISHEYE",
     ] = "auto"
-    """COLMAP camera model where none is given; 'auto': SIMPLE_RADIAL, OPENCV_FISHEYE if the lens is one."""
+    """COLMAP camera model of cameras without known intrinsics; 'auto' is SIMPLE_RADIAL, or
+    OPENCV_FISHEYE if the lens needs it."""
 
     use_exif_focal: bool = True
-    """Whether focal lengths start from EXIF and COLMAP's sensor database, unless an image was cropped."""
+    """Start focal lengths from EXIF and COLMAP's sensor database, except for cropped images."""
 
     default_focal_ratio: float = Field(1.2, ge=0.2, le=25.0)
-    """Focal length that is assumed where nothing is known, as a multiple of the longer side."""
+    """Focal length assumed if nothing is known, as a multiple of the longer image side."""

@@ -8,9 +8,9 @@ from snakesfm.config.base import StageOptions
 
 
 class IndexMatchesOptions(StageOptions):
-    """How matches without keypoints are expressed in merged keypoints; unused with keypoints."""
+    """How matches found without keypoints are assigned to merged keypoints; unused with a detector."""
 
     stage_version: ClassVar[int] = 1
 
     max_distance_px: float = Field(3.0, gt=0.0, le=100.0)
-    """Largest distance of a match's place from its keypoint; matches farther away are left out."""
+    """Largest distance of a matched position from its keypoint; matches farther away are dropped."""

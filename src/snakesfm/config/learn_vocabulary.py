@@ -16,10 +16,10 @@ class LearnVocabularyOptions(StageOptions):
     """Number of words (k-means clusters) of the codebook."""
 
     max_samples: int = Field(50_000, ge=1000, le=10_000_000)
-    """Most descriptors that the codebook is learned from, drawn evenly from all images."""
+    """Largest number of descriptors used for learning, drawn evenly from all images."""
 
     largest_share: float = Field(0.3, gt=0.0, le=1.0)
-    """Share of each image's keypoints that takes part, those of largest scale first."""
+    """Share of each image's keypoints that is used, those with the largest scales."""
 
     iterations: int = Field(10, ge=1, le=1000)
-    """Rounds of k-means."""
+    """Largest number of k-means iterations."""

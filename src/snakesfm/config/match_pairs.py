@@ -22,31 +22,37 @@ class MatchPairsOptions(StageOptions):
         "loftr",
         "virtual_places",
     ] = "mutual_ratio"
-    """Nearest neighbours, a network, an oracle, hloc's file, or a matcher without keypoints."""
+    """Nearest neighbours, a network, an oracle, hloc's file, or a matcher without keypoints; see
+    docs/front_ends.md."""
 
     max_ratio: float = Field(0.8, gt=0.0, le=1.0)
-    """Largest ratio of the distances to the nearest and second nearest descriptor (1: no test)."""
+    """Largest ratio of the distances to the nearest and the second nearest descriptor; 1 turns the test
+    off."""
 
     search: Literal["clustered", "exact"] = "clustered"
-    """Where nearest descriptors are looked for: among those of like words (much cheaper), or among all."""
+    """Search for nearest descriptors among those with similar words (much faster), or among all."""
 
     words: int = Field(32, ge=1, le=256)
-    """Words of the codebook that clustered search learns on each image; few keypoints get fewer words."""
+    """Number of words in the codebook that clustered search learns on each image; fewer if it has few
+    keypoints."""
 
     probes: float = Field(3.0, ge=1.0, le=256.0)
-    """Words that a descriptor is compared with, on average over an image; more find more of the matches."""
+    """Number of words that a descriptor is compared with, on average over an image; more find more
+    matches."""
 
     min_score: Annotated[float, Field(ge=0.0, le=1.0)] | Literal["auto"] = "auto"
-    """Least confidence of a match that a network makes; 'auto' is 0.1, and 0.2 without keypoints."""
+    """Smallest confidence of a match made by a network; 'auto' is 0.1, or 0.2 without keypoints."""
 
     longer_side_px: int = Field(840, ge=64, le=20_000)
-    """Longer side to which a matcher without keypoints has images scaled down; the shorter keeps 64."""
+    """Longer side to which images are scaled down for a matcher without keypoints; the shorter side
+    stays at least 64."""
 
     spread_px: float = Field(2.0, ge=0.0, le=100.0)
-    """How far from its point the oracle 'virtual_places' puts a place, along x and y."""
+    """Largest shift, in x and y, of the matched positions of the oracle 'virtual_places' from the true
+    point."""
 
     noise_px: float = Field(0.3, ge=0.0, le=100.0)
-    """Standard deviation of the second place of each match of the oracle 'virtual_places'."""
+    """Standard deviation of the second position of each match of the oracle 'virtual_places'."""
 
     def resolved(self) -> Self:
         """The options with 'auto' replaced by what it means for the method."""

@@ -8,9 +8,9 @@ from snakesfm.config.base import StageOptions
 
 
 class MergeKeypointsOptions(StageOptions):
-    """How the places that a matcher without keypoints finds become keypoints; unused with keypoints."""
+    """How positions matched without keypoints are merged into keypoints; unused with a detector."""
 
     stage_version: ClassVar[int] = 2
 
     radius_px: float = Field(3.0, gt=0.0, le=100.0)
-    """Places of an image within this distance of a surer one are merged into it."""
+    """Positions in an image within this distance of a more confident one are merged into it."""

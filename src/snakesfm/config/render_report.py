@@ -8,9 +8,10 @@ from snakesfm.config.base import StageOptions
 
 
 class RenderReportOptions(StageOptions):
-    """What the report shows."""
+    """Contents of the report."""
 
     stage_version: ClassVar[int] = 2
 
     max_images: int = Field(1000, ge=1)
-    """Rows of the table of images; of more images those with the fewest observations are shown."""
+    """Largest number of rows in the table of images; if there are more, those with the fewest
+    observations are shown."""

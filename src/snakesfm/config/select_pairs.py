@@ -7,7 +7,7 @@ from pydantic import Field
 from snakesfm.config.base import StageOptions
 
 MANY_IMAGES = 500
-# a look at a pair takes half a millisecond, matching it fifteen
+# previewing a pair takes half a millisecond, matching it fifteen
 MANY_IMAGES_TO_LOOK_AT = 1_000
 SHORTLIST = 100
 
@@ -27,34 +27,39 @@ class SelectPairsOptions(StageOptions):
         "sequential+spatial",
         "listed",
     ] = "auto"
-    """All pairs, neighbours by name, similar images, neighbours by GPS, or a list's; 'auto' decides."""
+    """All pairs, neighbours by name, similar images, neighbours by GPS, or your list; 'auto' takes your
+    list, else all pairs of few images, else sequential+retrieval."""
 
     exhaustive_up_to: Annotated[int, Field(ge=2, le=100_000)] | Literal["auto"] = "auto"
-    """Images up to which 'auto' takes all pairs: itself 1000 where pairs are looked at, else 500."""
+    """Number of images up to which 'auto' takes all pairs; 'auto' is 1000 if pairs are previewed with
+    their largest keypoints, otherwise 500."""
 
     look_ahead: int = Field(10, ge=1, le=10_000)
-    """How many following images, in the natural order of names, an image is paired with by 'sequential'."""
+    """Number of following images, in natural order of names, with which 'sequential' pairs an image."""
 
     top_k: Annotated[int, Field(ge=1, le=100_000)] | Literal["auto"] = "auto"
-    """Similar or near images that are proposed; 'auto' is 100 to look at, else 15, 30 from 500 images."""
+    """Candidate partners proposed per image; 'auto' is 100 if candidates are previewed, otherwise 15
+    (30 from 500 images on)."""
 
     min_score: float = Field(0.0, ge=-1.0, le=1.0)
-    """Least similarity of a pair chosen by 'retrieval'."""
+    """Smallest similarity of a pair proposed by 'retrieval'."""
 
     preview_keypoints: int = Field(400, ge=0, le=10_000)
-    """Largest SIFT keypoints by which proposed pairs are looked at before they are matched (0: no look)."""
+    """Number of largest SIFT keypoints per image with which proposed pairs are previewed before
+    matching; 0 turns the preview off."""
 
     min_likeness: float = Field(1.5, ge=0.0)
-    """Least resemblance of these keypoints in a pair that is matched; higher leaves more pairs out."""
+    """Smallest likeness (preview score) of a pair that is matched; higher values leave out more pairs."""
 
     least_partners: int = Field(16, ge=0, le=10_000)
-    """Partners that each image keeps, the most alike ones, however little they resemble it."""
+    """Partners kept per image however small their likeness, the most similar first."""
 
     enough_partners: int = Field(30, ge=0, le=10_000)
-    """Partners that each image keeps: half the most alike, half every second of the next (0: all)."""
+    """Partners kept per image (0 keeps all): one half are the most similar, the other half every second
+    one of those that follow."""
 
     enough_likeness: float = Field(250.0, ge=0.0)
-    """Images that resemble theirs little keep more, until likeness sums to this."""
+    """An image with weakly similar partners keeps more of them, until their likeness sums to this."""
 
     def resolve(self, image_count: int, pairs_file: str = "", detector: str = "sift") -> Self:
         """The options with every 'auto' replaced by what it means for a number of images.
@@ -63,8 +68,8 @@ class SelectPairsOptions(StageOptions):
         ----------
         image_count : number of images of the scene.
         pairs_file : path of the user's list of pairs, or "" for none; 'auto' follows a list that is given.
-        detector : whose keypoints there are before pairs are chosen, or "" for none. Only SIFT's are looked
-            at: others have no scales, and what their descriptors resemble was never measured.
+        detector : whose keypoints there are before pairs are chosen, or "" for none. Only SIFT's are used
+            for previews: others have no scales, and how well their descriptors serve was never measured.
         """
         look = self.preview_keypoints > 0 and detector == "sift"
         most = self.exhaustive_up_to
@@ -103,7 +108,7 @@ class SelectPairsOptions(StageOptions):
 
     @property
     def looks_at_pairs(self) -> bool:
-        """Whether keypoints are looked at before pairs are chosen, once the options are resolved."""
+        """Whether pairs are previewed before they are chosen, once the options are resolved."""
         return self.preview_keypoints > 0
 
     def count_proposed(self, images: int, listed: int = 0) -> int:
@@ -119,6 +124,6 @@ class SelectPairsOptions(StageOptions):
         return min(images * per_image, everything)
 
     def count_chosen(self, images: int, proposed: int) -> int:
-        """How many of the proposed pairs stay after the look, at most where links are not weak."""
+        """How many of the proposed pairs the preview keeps, at most if links are not weak."""
         limited = self.looks_at_pairs and self.enough_partners > 0
         return min(images * self.enough_partners, proposed) if limited else proposed

@@ -26,7 +26,7 @@ def find_model(folder: Path) -> Path:
             ):
                 return folder / place
     raise ConfigError(
-        f"{folder} holds no COLMAP model: name a folder with cameras, images and points3D "
+        f"{folder} does not contain a COLMAP model: give a folder with cameras, images and points3D "
         "as .bin or .txt, or the folder above its sparse/0."
     )
 

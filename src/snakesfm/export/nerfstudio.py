@@ -117,15 +117,15 @@ def camera_warnings(camera: Camera, camera_id: int) -> list[str]:
     if not held.all():
         warnings.append(
             f"camera {camera_id} ({camera.model}): the distortion is not invertible in the whole image, "
-            "so tools that undistort will show folds near its corners."
+            "so undistorted images will show folds near their corners."
         )
     if _native_terms(camera) is not None:
         return warnings
     fit = _fit_terms(camera)
     if fit is None:
         warnings.append(
-            f"camera {camera_id} ({camera.model}): too little of the image lies within the lens to fit its "
-            "distortion, so transforms.json has none: check its intrinsics."
+            f"camera {camera_id} ({camera.model}): too little of the image is within the lens's field of "
+            "view to fit its distortion, so transforms.json has none: check the intrinsics."
         )
     elif fit[2] > FIT_PX:
         warnings.append(

@@ -87,8 +87,8 @@ def _check_size(images: Path, model: "pycolmap.Reconstruction", image: "pycolmap
     header, camera = read_header(images / image.name), model.cameras[image.camera_id]
     if (header.width, header.height) != (camera.width, camera.height):
         raise ImageError(
-            f"{images / image.name} has {header.width} x {header.height} pixels but its camera "
-            f"{camera.width} x {camera.height}: put back the image that the model was made of."
+            f"{images / image.name} has {header.width} x {header.height} pixels, but its camera "
+            f"{camera.width} x {camera.height}: restore the image that the model was made from."
         )
 
 

@@ -58,7 +58,7 @@ class Surface:
                 radius *= 2
         if best is None:
             raise ConfigError(
-                "The reference model's points span no surface: say extract_features.surface_points=0."
+                "The reference model's points span no surface: set extract_features.surface_points to 0."
             )
         return np.asarray(best.vertices), np.asarray(best.triangles)
 
@@ -76,5 +76,5 @@ def _load_open3d() -> Any:
     except ImportError as error:
         raise ConfigError(
             f"extract_features.surface_points needs open3d, which cannot be loaded ({error}): run "
-            "'pip install -c constraints.txt .[surface]' in snakesfm's folder, or say surface_points=0."
+            "'pip install -c constraints.txt .[surface]' in snakesfm's folder, or set surface_points to 0."
         ) from None

@@ -47,9 +47,9 @@ class VirtualKeypoints:
     ) -> None:
         if not model.points3D and not view_points:
             raise ConfigError(
-                "The reference model has no points, which the front-end 'virtual' needs: give "
-                "reference=PATH of a model with points, extract_features.view_points=300 for points at "
-                "random depths, or another front_end."
+                "The reference model has no points, which the front-end 'virtual' needs: set reference= to "
+                "a model with points, set extract_features.view_points to 300 for points at random depths, "
+                "or use another front_end."
             )
         self._images = {image.name: image for image in model.images.values()}
         self._cameras = model.cameras

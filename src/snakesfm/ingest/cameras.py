@@ -292,8 +292,8 @@ def warn_of_own_cameras(
     if chosen or len(models) >= MODELS_OF_ONE_SIZE or not most_of_few_sizes:
         return []
     return [
-        f"{len(own)} images have a camera each: if one camera took them, and none was cropped by "
-        "itself, say index_images={camera_sharing: single}."
+        f"{len(own)} images have a camera of their own: if one camera took them all, and none was cropped "
+        "individually, set index_images={camera_sharing: single}."
     ]
 
 

@@ -24,7 +24,7 @@ MAX_OFF_CENTRE = 0.5
 # off alike in both directions: scaling does that, and hardly ever a lens or a crop
 MAX_SCALING = 0.2
 SAME_ASPECT = 0.03
-LIMIT = "; an images.txt beside a cameras.txt limits a camera to the images that it lists"
+LIMIT = "; with an images.txt next to a cameras.txt, a camera applies only to the images listed there"
 
 
 @dataclass(frozen=True)
@@ -70,16 +70,19 @@ def read_known_cameras(path: Path | str) -> KnownCameras:
             cameras = dict(_text_cameras(lines))
     except (ValueError, UnicodeDecodeError, struct.error, IndexError) as error:
         raise ConfigError(
-            f"{path}, given as cameras=, is neither COLMAP cameras nor a 3x3 matrix ({error}): correct it."
+            f"{path}, given as cameras=, is neither a COLMAP cameras file nor a 3x3 matrix ({error}): "
+            "correct it."
         ) from None
     if not cameras:
-        raise ConfigError(f"{path}, given as cameras=, holds no camera: correct it or remove the key.")
+        raise ConfigError(f"{path}, given as cameras=, contains no camera: correct it or remove the key.")
     for camera_id, camera in cameras.items():
         _check(path, camera_id, camera)
     camera_of = _image_cameras(path)
     missing = sorted(set(camera_of.values()) - set(cameras))
     if missing:
-        raise ConfigError(f"Images beside {path} name camera {missing[0]}, which it lacks: add it there.")
+        raise ConfigError(
+            f"The list of images next to {path} names camera {missing[0]}, which that file lacks: add it."
+        )
     return KnownCameras(path, cameras, camera_of)
 
 
@@ -110,7 +113,7 @@ def match_known_cameras(
             models_of[camera if len(known.cameras) > 1 else None].add(photograph.body[1])
     return list(found), [
         f"{known.path} gives one camera to images of {len(models)} camera models in EXIF "
-        f"({', '.join(sorted(models)[:3])}): list its images in an images.txt beside a cameras.txt."
+        f"({', '.join(sorted(models)[:3])}): list its images in an images.txt next to a cameras.txt."
         for models in models_of.values()
         if len(models) > 1
     ]
@@ -137,8 +140,8 @@ def _match_list(
         else:
             found.append(None)
     return found, [
-        f"{count} images that {known.listing} lacks took camera {camera_id} by their size: list them there "
-        "with the camera that took them."
+        f"{count} images not listed in {known.listing} were assigned camera {camera_id} by their size: "
+        "list them there with their camera."
         for camera_id, count in by_size.items()
         if count
     ]
@@ -154,7 +157,7 @@ def _listed_cameras(known: KnownCameras, names: Sequence[str]) -> list[int | Non
     if (rows < 0).all():
         raise ConfigError(
             f"{known.listing} names none of the images (it has '{others[0]}', the folder '{names[0]}'): "
-            "correct its names or move it away."
+            "correct the names or move the file away."
         )
     return [known.camera_of[others[row]] if row >= 0 else None for row in rows.tolist()]
 
@@ -171,9 +174,9 @@ def _match_size(known: KnownCameras, photograph: Photograph) -> Camera:
     same = _cameras_of_size(known, photograph)
     if len(same) != 1:
         raise ConfigError(
-            f"{known.path} holds {len(known.cameras)} cameras, of which {len(same)} have the size "
-            f"{photograph.width} x {photograph.height} of {photograph.name}: put the images.txt beside it "
-            "that says whose is which."
+            f"{known.path} has {len(known.cameras)} cameras, of which {len(same)} have the size "
+            f"{photograph.width} x {photograph.height} of {photograph.name}: put the images.txt next to it "
+            "that assigns images to cameras."
         )
     return known.cameras[same[0]]
 
@@ -184,7 +187,9 @@ def _find_file(path: Path) -> Path:
         for name in FILE_NAMES:
             if (path / name).is_file():
                 return path / name
-        raise ConfigError(f"{path}, given as cameras=, holds none of {', '.join(FILE_NAMES)}: name one.")
+        raise ConfigError(
+            f"{path}, given as cameras=, contains none of {', '.join(FILE_NAMES)}: give the file's path."
+        )
     if not path.is_file():
         raise ConfigError(f"{path}, given as cameras=, does not exist: correct the path or remove the key.")
     return path
@@ -201,7 +206,7 @@ def _matrix_camera(path: Path, rows: list[list[str]]) -> Camera:
     plain = K[2].tolist() == [0, 0, 1] and K[1, 0] == 0 and abs(K[0, 1]) < 1e-3 * abs(fx)
     if not (plain and np.isfinite(K).all() and min(fx, fy, cx, cy) > 0):
         raise ConfigError(
-            f"{path}, given as cameras=, is no matrix [fx 0 cx; 0 fy cy; 0 0 1] in pixels: correct it."
+            f"{path}, given as cameras=, is not a matrix [fx 0 cx; 0 fy cy; 0 0 1] in pixels: correct it."
         )
     return Camera("PINHOLE", 0, 0, (float(fx), float(fy), float(cx), float(cy)))
 
@@ -232,9 +237,7 @@ def _binary_cameras(data: bytes) -> Iterator[tuple[int, Camera]]:
 def _check(path: Path, camera_id: int, camera: Camera) -> None:
     where = f"Camera {camera_id} of {path}, given as cameras=,"
     if camera.model not in pycolmap.CameraModelId.__members__ or camera.model == "INVALID":
-        raise ConfigError(
-            f"{where} has the model '{camera.model}', which COLMAP does not know: correct it."
-        )
+        raise ConfigError(f"{where} has the unknown camera model '{camera.model}': use one of COLMAP's.")
     try:
         parsed = camera.to_pycolmap()
         focal = parsed.mean_focal_length()
@@ -242,7 +245,7 @@ def _check(path: Path, camera_id: int, camera: Camera) -> None:
     except (ValueError, RuntimeError):
         valid = False
     if not (valid and camera.width > 0 and camera.height > 0):
-        raise ConfigError(f"{where} does not have the parameters of a {camera.model}: correct it.")
+        raise ConfigError(f"{where} has an invalid size or parameters for a {camera.model}: correct them.")
 
 
 def _image_cameras(path: Path) -> dict[str, int]:
@@ -256,7 +259,7 @@ def _image_cameras(path: Path) -> dict[str, int]:
         return dict(_text_image_cameras(listing.read_text("utf-8-sig")))
     except (ValueError, UnicodeDecodeError, struct.error, IndexError) as error:
         raise ConfigError(
-            f"{listing}, beside the file given as cameras=, is no COLMAP list of images ({error}): "
+            f"{listing}, next to the file given as cameras=, is not a COLMAP list of images ({error}): "
             "correct it or move it away."
         ) from None
 
@@ -269,7 +272,7 @@ def _text_image_cameras(text: str) -> Iterator[tuple[str, int]]:
             continue
         # a list without lines of points would lose every second image
         if len(points.split()) % 3 or (points and not points.split()[-1].lstrip("-").isdigit()):
-            raise ValueError(f"'{points[:60]}' stands where the points of the image before it belong")
+            raise ValueError(f"expected the points of the image before, found '{points[:60]}'")
         words = line.split(maxsplit=9)
         if len(words) < 10:
             raise ValueError(f"'{line[:60]}' has fewer than 10 words")
@@ -301,9 +304,9 @@ def _match_matrix(known: KnownCameras, photographs: Sequence[Photograph]) -> Ite
     scaled = abs(across / down - 1) <= SAME_ASPECT and abs(across - 1) > MAX_SCALING
     if scaled or max(abs(across - 1), abs(down - 1)) > MAX_OFF_CENTRE:
         raise ConfigError(
-            f"The principal point ({cx:g}, {cy:g}) of {known.path} is that of images of about "
+            f"The principal point ({cx:g}, {cy:g}) of {known.path} belongs to images of about "
             f"{2 * cx:.0f} x {2 * cy:.0f} pixels, but the images have {width} x {height}: give the matrix "
-            "for the size of the images, or, if they were cropped, a cameras.txt that states it."
+            "for the size of the images or, if they were cropped, a cameras.txt that states their size."
         )
     sized = replace(camera, width=width, height=height)
     for photograph in photographs:
@@ -321,8 +324,8 @@ def _fit(path: Path, camera: Camera, photograph: Photograph, hint: str = "") -> 
         if (camera.height, camera.width) == (width, height):
             hint = "; images are used as stored, without their EXIF rotation" + hint
         raise ConfigError(
-            f"{photograph.name} has {width} x {height} pixels, which is no scaling of the {camera.width} x "
-            f"{camera.height} of its camera in {path}: correct that file or the image{hint}."
+            f"{photograph.name} has {width} x {height} pixels, another aspect ratio than its camera in "
+            f"{path}, {camera.width} x {camera.height}: correct that file or the image{hint}."
         )
     scaled = camera.to_pycolmap()
     scaled.rescale(width, height)

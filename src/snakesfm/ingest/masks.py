@@ -56,8 +56,8 @@ def read_mask(path: Path, size: tuple[int, int]) -> "NDArray[Any]":
     height, width = gray.shape
     if abs(width * size[1] / (height * size[0]) - 1.0) > MAX_ASPECT_DIFFERENCE:
         raise ConfigError(
-            f"The mask {path} has {width} x {height} pixels but its image {size[0]} x {size[1]}: give one "
-            "that shows the whole image, turned as the image is stored."
+            f"The mask {path} has {width} x {height} pixels, but its image {size[0]} x {size[1]}: give a "
+            "mask of the whole image, in the orientation in which the image is stored."
         )
     wanted: NDArray[Any] = gray > 0
     return wanted

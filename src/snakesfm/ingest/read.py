@@ -150,12 +150,12 @@ def _open(path: Path | str) -> Image.Image:
         raise ImageError(f"{path} does not exist or is a broken link: restore or remove it.") from None
     except UnidentifiedImageError:
         raise ImageError(
-            f"{path} is no JPEG, PNG, TIFF, WebP or BMP image: convert it to one of these or remove it."
+            f"{path} is not a JPEG, PNG, TIFF, WebP or BMP image: convert it to one of these or remove it."
         ) from None
     except ImageError:
         raise
     except PermissionError:
-        raise ImageError(f"{path} may not be read: correct its permissions or remove it.") from None
+        raise ImageError(f"{path} cannot be read: correct its permissions or remove it.") from None
     except Exception as error:
         raise ImageError(
             f"{path} is damaged ({error}): replace it by an intact copy or remove it."
@@ -184,7 +184,7 @@ def _check_end(path: Path, image: Image.Image) -> None:
         elif image.format == "TIFF":
             complete = _tiff_is_complete(image, len(data))
     if not complete:
-        raise ImageError(f"{path} is cut off before its end: replace it by an intact copy or remove it.")
+        raise ImageError(f"{path} is truncated: replace it by an intact copy or remove it.")
 
 
 def _jpeg_is_complete(data: mmap.mmap) -> bool:

@@ -35,7 +35,7 @@ def read_checkpoint(model: str, folder: Path, command: str) -> Mapping[str, Any]
         expected = WEIGHT_FILES[model].sha256 or read_sums(folder).get(path.name, "")
     if expected and file_sha256(path) != expected:
         raise ConfigError(
-            f"{path} is not the known file of '{model}' (its SHA-256 differs): remove it and run "
+            f"{path} is not the expected file for '{model}' (its SHA-256 differs): remove it and run "
             f"'{command}'."
         )
     torch = load_torch()
@@ -54,7 +54,7 @@ def read_checkpoint(model: str, folder: Path, command: str) -> Mapping[str, Any]
     except Exception as error:
         reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
         raise ConfigError(
-            f"{path} holds no weights that torch can read ({reason}): remove it and run '{command}'."
+            f"{path} contains no weights that torch can read ({reason}): remove it and run '{command}'."
         ) from None
 
 

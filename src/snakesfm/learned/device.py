@@ -35,8 +35,8 @@ def use_device(wanted: str) -> None:
     global _wanted
     if wanted == "cuda" and not load_torch().cuda.is_available():
         raise ConfigError(
-            "device is 'cuda', but the job finds no CUDA device: ask the cluster for one with "
-            "--profile profiles/slurm-gpu on a partition that has GPUs, or say device=cpu."
+            "device is 'cuda', but the job finds no CUDA device: request one from the cluster with "
+            "--profile profiles/slurm-gpu on a partition with GPUs, or set device=cpu."
         )
     _wanted = wanted
 

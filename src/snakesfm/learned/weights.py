@@ -137,8 +137,8 @@ def find_weights(model: str, folder: Path, command: str) -> Path:
     path = weights_path(model, folder)
     if not path.is_file():
         raise ConfigError(
-            f"The weights of '{model}' are missing ({path}): fetch them once where there is internet with "
-            f"'{command}', or give another folder with weights=DIR."
+            f"The weights of '{model}' are missing ({path}): download them once, on a machine with "
+            f"internet access, with '{command}', or choose another folder with weights=DIR."
         )
     return path
 

@@ -79,7 +79,7 @@ class LightglueMatcher:
         if points.descriptors.shape[1] != size:
             raise ConfigError(
                 f"LightGlue for {self._detector} needs descriptors of {size} numbers, not of "
-                f"{points.descriptors.shape[1]}: let extract_features.method be '{self._detector}'."
+                f"{points.descriptors.shape[1]}: set extract_features.method to '{self._detector}'."
             )
         columns = {
             "keypoints": points.keypoints.astype(np.float32),

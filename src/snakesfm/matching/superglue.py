@@ -41,7 +41,7 @@ class SuperglueMatcher:
         if first.descriptors.shape[1] != self.descriptor_size:
             raise ConfigError(
                 f"SuperGlue needs SuperPoint's descriptors of {self.descriptor_size} numbers, not of "
-                f"{first.descriptors.shape[1]}: let extract_features.method be 'superpoint'."
+                f"{first.descriptors.shape[1]}: set extract_features.method to 'superpoint'."
             )
         size = np.array(first.image_size, np.float32)
         # as in an image of one by one, so that two images of other sizes can be given together

@@ -1,1 +1,1 @@
-"""What a person reads about a scene: counts, plots and reasons, as one HTML file."""
+"""The report about a scene: counts, plots and reasons, as one HTML file."""

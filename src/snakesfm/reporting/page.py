@@ -45,9 +45,9 @@ TEMPLATE = """<!DOCTYPE html>
 {% if page.maps %}<div class="side">
 {% for caption, plot in page.maps %}<figure>{{ plot | safe }}<figcaption>{{ caption }}</figcaption></figure>
 {% endfor %}</div>
-<p class="note">Each triangle is a camera, its tip at the centre; rest on it for the image's name.</p>
+<p class="note">Each triangle is a camera, its tip the centre; hover over it for the image's name.</p>
 {% else %}<p>No image is registered.</p>{% endif %}
-<h2>What each stage did</h2>
+<h2>Stages</h2>
 {{ table(page.stage_heads, page.stages) }}
 {% for title, heads, rows in page.tables %}{% if rows %}
 <h2>{{ title }}</h2>{{ table(heads, rows) }}{% endif %}{% endfor %}

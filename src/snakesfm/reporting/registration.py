@@ -1,4 +1,4 @@
-"""Per image: what each step made of it, and why an image has no pose."""
+"""Per image: what each stage kept of it, and why an image has no pose."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -11,7 +11,7 @@ Array = NDArray[Any]
 
 @dataclass(frozen=True)
 class ImageCounts:
-    """What each step left of every image, columns of length N."""
+    """What each stage kept of every image, columns of length N."""
 
     pairs: Array
     accepted: Array
@@ -62,23 +62,23 @@ def reason_not_registered(
     if counts.registered[image]:
         return ""
     if duplicate_of:
-        return f"It has the same bytes as {duplicate_of}, which stands for it."
+        return f"It is an exact copy of {duplicate_of}, which is used instead."
     if counts.pairs[image] == 0:
-        return "No pair with it was selected and matched."
+        return "No pair with this image was selected and matched."
     if counts.accepted[image] == 0:
         return f"None of its {counts.pairs[image]} pairs was accepted: {_listed(rejections)}."
     if counts.kept[image] == 0:
         return f"All its {counts.accepted[image]} view-graph edges were refused: {_listed(edge_labels)}."
     if counts.models[image] > 0:
         size = int(np.sum(counts.models == counts.models[image]))
-        return f"It is in a model of its own of {size} images, in sparse/{counts.models[image]}."
+        return f"It is in a separate model of {size} images, in sparse/{counts.models[image]}."
     if counts.components[image] != 0:
         size = int(np.sum(counts.components == counts.components[image]))
         return f"It is in a component of {size} images that is not connected to the largest one."
     if not counts.rotated[image]:
-        return "Rotation averaging gave it no rotation."
+        return "Rotation averaging found no rotation for it."
     if counts.track_observations[image] == 0:
-        return "No track passes through it."
+        return "It is in no track."
     if counts.point_observations[image] == 0:
         return "None of its tracks could be triangulated."
     return "Bundle adjustment dropped it: too few of its observations agreed with the model."

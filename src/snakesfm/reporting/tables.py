@@ -90,7 +90,7 @@ def image_rows(
     note = ""
     if len(names) > most:
         shown = np.sort(np.argsort(counts.observations, kind="stable")[:most])
-        note = f"The {most:,} images with the fewest observations of {len(names):,}."
+        note = f"Only the {most:,} of {len(names):,} images with the fewest observations are shown."
     rows = []
     for image in shown.tolist():
         error = float(counts.mean_error_px[image])

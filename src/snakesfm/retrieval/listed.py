@@ -68,11 +68,11 @@ def _explain(text: str, rows: Mapping[str, int], place: str) -> str:
 
     parts = text.split("\t") if "\t" in text else text.split()
     if len(parts) < 2:
-        return f"{place}: '{text}' is no pair of image names: write 'name0 name1' on each line."
+        return f"{place}: '{text}' is not a pair of image names: write 'name0 name1' on each line."
     if len(parts) > 2:
         return (
             f"{place}: '{text}' does not split into two known image names: write them relative to the "
-            "image folder, with a tab between them if they hold spaces."
+            "image folder, with a tab between them if they contain spaces."
         )
     unknown = next((part.strip() for part in parts if part.strip() not in rows), text)
     near = difflib.get_close_matches(unknown, list(rows), 1)

@@ -130,7 +130,7 @@ def edge_residuals(pairs: Array, rotations: Array, averaged: Array) -> Array:
 
 def _check(node_count: int, pairs: Array, rotations: Array) -> None:
     if len(pairs) == 0:
-        raise SceneError("The view graph has no edge to average: see why filter_view_graph refused them.")
+        raise SceneError("The view graph has no edge to average: see why filter_view_graph refused all.")
     if len(rotations) != len(pairs):
         raise ValueError(f"{len(pairs)} pairs but {len(rotations)} rotations")
     if pairs.min() < 0 or pairs.max() >= node_count:

@@ -22,4 +22,4 @@ def make_averager(method: str) -> RotationAverager:
         from snakesfm.rotation_averaging.shonan import ShonanAverager
 
         return ShonanAverager()
-    raise ValueError(f"there is no rotation averager '{method}': choose two_stage, irls or shonan")
+    raise ValueError(f"there is no rotation averager '{method}': use two_stage, irls or shonan")

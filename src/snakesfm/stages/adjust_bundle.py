@@ -86,7 +86,7 @@ def run(job: StageJob) -> None:
             if mine.any():
                 print(
                     f"part {component + 1} is left out: {posed} of its {mine.sum()} images have a pose, "
-                    f"and a model takes {least}",
+                    f"and a model needs {least}",
                     flush=True,
                 )
             continue
@@ -102,8 +102,8 @@ def run(job: StageJob) -> None:
         raise SceneError(
             f"Scene '{job.scene}': bundle adjustment kept fewer than two images: the averaged poses do not "
             "fit the tracks; check the cameras' focal lengths, or lower adjust_bundle.min_observations. "
-            "Photographs that were all taken from one place, as for a panorama, show no depth; an object "
-            "that turns before a fixed background needs masks=."
+            "Photographs all taken from one position, as for a panorama, cannot be reconstructed; an "
+            "object rotating in front of a fixed background needs masks=."
         )
     adjusted.sort(key=lambda found: -found[0].registered.sum())
     final = tuple(restore_cameras(cameras, originals, job.settings))
@@ -231,7 +231,7 @@ def _print_record(record: RoundRecord) -> None:
         ids = sorted(camera_id for camera_id, what in record.wild.items() if what == cause)
         more = f" and {len(ids) - MOST_NAMED} more" if len(ids) > MOST_NAMED else ""
         named = ", ".join(str(camera_id) for camera_id in ids[:MOST_NAMED])
-        print(f"{record.name}: cameras reset as their {cause} was not plausible: {named}{more}")
+        print(f"{record.name}: cameras reset because their {cause} was implausible: {named}{more}")
     images, points, observations = record.counts
     print(
         f"{record.name}: cost {record.costs[0]:.1f} -> {record.costs[1]:.1f}, {images} images, "

@@ -62,10 +62,10 @@ def run(job: StageJob) -> None:
     ).write(job.output, job.header)
     kept = reasons == "kept"
     others = np.count_nonzero(components > 0)
-    more = f" and {others} in {components.max()} components beside" if others else ""
+    more = f" and {others} in {components.max()} other components" if others else ""
     print(
         f"average_rotations: {np.count_nonzero(components == 0)} of {image_count} images{more},"
         f" {np.count_nonzero(kept)} edges with a median residual of {np.median(residuals[kept]):.2f} deg,"
-        f" {np.count_nonzero(kept & ~filtered)} of them had been refused before",
+        f" {np.count_nonzero(kept & ~filtered)} of them refused by filter_view_graph before",
         file=sys.stderr,
     )

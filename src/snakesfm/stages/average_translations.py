@@ -92,7 +92,7 @@ def run(job: StageJob) -> None:
     if placed < 2:
         raise SceneError(
             f"Scene '{job.scene}': no two images could be positioned from {len(pairs)} image pairs and "
-            f"{len(tracks.offsets) - 1} tracks: add images taken from different places with more overlap."
+            f"{len(tracks.offsets) - 1} tracks: add images from different positions with more overlap."
         )
     residuals = np.full(len(graph.pairs), np.nan)
     residuals[usable] = np.degrees(result.edge_residuals_rad)

@@ -60,7 +60,7 @@ def run(job: StageJob) -> None:
     lengths = np.diff(tracks.offsets)
     print(
         f"{count} tracks of {lengths.mean():.2f} images on average from {len(matches)} matches; "
-        f"{tracks.conflicts} components saw an image twice"
+        f"{tracks.conflicts} components contained two points of one image"
     )
     nothing = np.zeros(0, np.int64)
     unmerged, merged = nothing, nothing
@@ -69,8 +69,8 @@ def run(job: StageJob) -> None:
         unmerged, merged = compare_track_lengths(
             keypoints, pairs, offsets, matches, lambda i, j: found[i, j]
         )
-        print(f"joined as they were found: {describe_lengths(unmerged)}")
-        print(f"in merged keypoints: {describe_lengths(merged)}, before any is split or left out")
+        print(f"before merging keypoints: {describe_lengths(unmerged)}")
+        print(f"after merging keypoints: {describe_lengths(merged)}, before any is split or left out")
     base = np.r_[0, np.cumsum([len(k) for k in keypoints])]
     rows = base[tracks.image_ids] + tracks.keypoint_ids
     TrackTable(

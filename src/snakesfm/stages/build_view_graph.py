@@ -44,7 +44,8 @@ def run(job: StageJob) -> None:
     if edge_count == 0:
         raise SceneError(
             f"No two images of scene '{job.scene}' overlap well enough ({refused} pairs were tried): add"
-            " images that see the same things from nearby, or lower the inlier limits of estimate_two_view."
+            " images of the same objects from nearby positions, or lower the inlier limits of"
+            " estimate_two_view."
         )
     order = np.lexsort((merged["pairs"][:, 1], merged["pairs"][:, 0]))
     merged = {name: values[order] for name, values in merged.items()}

@@ -45,8 +45,8 @@ def run(job: StageJob) -> None:
     places = {image: first_rows_at_place(points) for image, points in keypoints.items()}
     for image in images - keypoints.keys():
         raise ArtifactError(
-            f"{job.path('matches')} names image {index.names[image]}, which no features file "
-            "holds: delete both and run again."
+            f"{job.path('matches')} names image {index.names[image]}, which is in no features file: "
+            "delete both and run again."
         )
     pairs: list[tuple[int, int]] = [(int(i), int(j)) for i, j in matches.pairs]
     cameras_of = [(of_camera[index.camera_ids[i]], of_camera[index.camera_ids[j]]) for i, j in pairs]

@@ -30,7 +30,7 @@ def run(job: StageJob) -> None:
     clash = next(clashing_names(names), None)
     if clash is not None:
         raise ConfigError(
-            f"hloc's files cannot tell the images '{clash[0]}' and '{clash[1]}' apart: rename one of them."
+            f"hloc's files cannot distinguish the images '{clash[0]}' and '{clash[1]}': rename one of them."
         )
     features, matches, pairs = job.outputs
     places: dict[int, Array] = {}

@@ -37,50 +37,51 @@ SUMMARY = "summary.json"
 UNDISTORTED = "undistorted"
 TEMPORARY = ".export."
 SPACES = (
-    "Some image names hold spaces, at which COLMAP cuts names when it reads images.txt: use the .bin files."
+    "Some image names contain spaces, where COLMAP cuts them when it reads images.txt: use the .bin files."
 )
 
 OTHER_MODELS = (
-    "{images} images have no tie to the others: each part of them is a model of its own, in a world of its "
-    "own, in a folder beside sparse/0 ({count} in number)."
+    "{images} images could not be connected to the largest model: they form {count} separate models, each "
+    "in its own coordinate frame, in folders next to sparse/0."
 )
 
 MISSING_MASKS = (
-    "transforms.json names no masks, as nerfstudio wants one of its image's size for every image: {count} "
-    "images have none such, '{first}' for one."
+    "{count} images have no mask of their own size, e.g. '{first}', and nerfstudio needs one for every "
+    "image, so transforms.json names none."
 )
 
 MIXED_LENSES = (
-    "transforms.json holds fisheye and perspective cameras, which nerfstudio takes for one kind: use "
+    "transforms.json contains fisheye and perspective cameras, which nerfstudio treats as one kind: use "
     "export_model={undistort: true}, or a scene for each kind."
 )
 
 REFUSED = "{count} image files could not be used (all in the report): {first}"
 
 OTHER_LENS = (
-    "camera {camera} ({model}): errors follow the distance from the principal point, so its lens has "
-    "another distortion: another index_images.camera_model (RADIAL, OPENCV) or other intrinsics may fit it."
+    "camera {camera} ({model}): reprojection errors grow with distance from the principal point, so this "
+    "model does not describe the lens; try another index_images.camera_model (RADIAL, OPENCV) or other "
+    "intrinsics."
 )
 
 RESET_CAMERA = (
-    "camera {camera} ({model}): its {cause} was not plausible in the last pass of bundle adjustment, so it "
-    "was reset and held: an index_images.camera_model of fewer terms, or other intrinsics, may fit it."
+    "camera {camera} ({model}): its {cause} was implausible in the last pass of bundle adjustment, so it "
+    "was reset and kept fixed; try an index_images.camera_model with fewer parameters, or other intrinsics."
 )
 
-# more of them tell no more of a lens
+# more of them add nothing about a lens
 OBSERVATIONS_OF_LENSES = 500_000
 
 NO_PLACE = (
-    "georeference is true, but fewer than four registered images tell their position in EXIF, or these "
-    "agree with no model."
+    "georeference is true, but fewer than four registered images have GPS in EXIF, or it does not agree "
+    "with the model: the model is not georeferenced."
 )
 
 UNTRUSTED_PLACE = (
-    "georeference is true, but the positions in EXIF do not tell where the model is: {inliers} of {images} "
-    "agree with it, or they lie on one line."
+    "georeference is true, but the GPS positions in EXIF do not determine it reliably: only {inliers} of "
+    "{images} agree with the model, or they lie on one line."
 )
 
-COPIES = "{count} images are copies of others, byte for byte, and are left out: the others stand for them."
+COPIES = "{count} images are exact copies of others and are left out; the originals are used."
 
 
 def run(job: StageJob) -> None:

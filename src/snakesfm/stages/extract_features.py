@@ -150,7 +150,7 @@ class ImportedKeypoints:
         """
         columns = read_hloc_features(self._file, name)
         if columns is None:
-            print(f"warning: {self._file.filename} has no keypoints of '{name}'")
+            print(f"warning: {self._file.filename} has no keypoints for '{name}'")
             return KeypointSet.empty(self.descriptor_size, self.descriptor_dtype)
         columns["descriptors"] = self._of_one_length(columns["descriptors"], name)
         found_in = read_hloc_size(self._file, name) or size
@@ -171,11 +171,11 @@ class ImportedKeypoints:
             return descriptors
         if length:
             raise ConfigError(
-                f"{self._file.filename} has descriptors of {length} numbers of '{name}', but of "
-                f"{self.descriptor_size} of other images: give the features of one detector."
+                f"{self._file.filename} has descriptors of length {length} for '{name}', but of "
+                f"{self.descriptor_size} for other images: use the features of one detector."
             )
         if count:
-            print(f"warning: {self._file.filename} has no descriptors of '{name}'; zeros take their place")
+            print(f"warning: {self._file.filename} has no descriptors for '{name}'; zeros are used instead")
         return np.zeros((count, self.descriptor_size), self.descriptor_dtype)
 
     def _scaled(self, points: KeypointSet, name: str, size: tuple[int, int]) -> KeypointSet:
@@ -184,9 +184,9 @@ class ImportedKeypoints:
         x, y = (own / other for own, other in zip(size, points.image_size, strict=True))
         if abs(x / y - 1) > ASPECT_TOLERANCE:
             raise ConfigError(
-                f"{self._file.filename} has the keypoints of '{name}' in an image of {seen} pixels, but "
-                f"its file here stores {here}: give the image that hloc saw, or let hloc read this one, "
-                "without turning it as EXIF says."
+                f"{self._file.filename} has keypoints for '{name}' from an image of {seen} pixels, but "
+                f"its file here has {here}: use the image that hloc read, or run hloc on this one without "
+                "applying its EXIF orientation."
             )
         if not self._told_of_scaling:
             print(
@@ -252,8 +252,8 @@ def _without_gaps(points: KeypointSet, name: str) -> KeypointSet:
     if not gaps.any():
         return points
     print(
-        f"warning: {gaps.sum()} of {len(points)} descriptors of '{name}' are not finite; zeros take their "
-        "place"
+        f"warning: {gaps.sum()} of {len(points)} descriptors of '{name}' are not finite; zeros are used "
+        "instead"
     )
     descriptors = points.descriptors.copy()
     descriptors[gaps] = 0

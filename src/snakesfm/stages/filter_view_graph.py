@@ -36,7 +36,7 @@ def run(job: StageJob) -> None:
         components=components,
     ).write(job.output, job.header)
     told = _cycles_tell(cycles, options)
-    few = "" if told else f"; {cycles.per_edge:.1f} 3-cycles per edge are too few to refuse any"
+    few = "" if told else f"; {cycles.per_edge:.1f} 3-cycles per edge are too few to refuse edges"
     print(
         f"filter_view_graph: {np.count_nonzero(labels == 0)} of {edge_count} edges kept,"
         f" {np.count_nonzero(components == 0)} of {image_count} images in the largest component{few}",

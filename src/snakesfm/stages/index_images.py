@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from snakesfm.config.index_images import IndexImagesOptions
 
 DIGESTS_NAME = "digests.json"
-UNREAD = "{path} is of a format that is not read: convert it to JPEG."
+UNREAD = "{path} has an unsupported format: convert it to JPEG."
 
 
 def run(job: StageJob) -> None:
@@ -92,11 +92,12 @@ def _check_scene(folder: Path, names: list[str], contents: set[str], refused: di
     _warn(refused.values())
     if not names:
         raise SceneError(
-            f"The folder '{folder}' holds no JPEG, PNG, TIFF, WebP or BMP image: add some or name another."
+            f"The folder '{folder}' contains no JPEG, PNG, TIFF, WebP or BMP image: add some or choose "
+            "another folder."
         )
     usable = "only one usable image (or copies of it)" if contents else "no usable image"
     first = f"; {len(refused)} refused, first: {next(iter(refused.values()))}" if refused else "."
-    raise SceneError(f"At least two images are needed, but '{folder}' holds {usable}: add images{first}")
+    raise SceneError(f"At least two images are needed, but '{folder}' contains {usable}: add images{first}")
 
 
 def _to_index(

@@ -65,7 +65,7 @@ def run(job: StageJob) -> None:
         colors=np.concatenate(colors),
     ).write(job.output, job.header)
     before = sum(len(places) for places, _ in found.values())
-    print(f"{len(rows)} images, {before} places of matches merged into {count} keypoints")
+    print(f"{len(rows)} images, {before} matched positions merged into {count} keypoints")
 
 
 def _gather(paths: list[Path], images: set[int]) -> Mapping[int, tuple[Array, Array]]:

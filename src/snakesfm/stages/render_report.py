@@ -126,7 +126,7 @@ def run(job: StageJob) -> None:
             *metric_tables(metrics),
         ],
         histogram=error_histogram(errors),
-        histogram_caption=f"Errors of {len(errors):,} observations; the last bar holds the largest 1 %.",
+        histogram_caption=f"Errors of {len(errors):,} observations; the last bar includes the largest 1 %.",
         missing=_missing(index, names, counts, pairs, graph),
         refused=[[str(a), str(b)] for a, b in zip(index.refused_names, index.refused_reasons, strict=True)],
         image_heads=heads,
@@ -215,8 +215,8 @@ def _stage_rows(
     }
     if len(tracks["lengths_unmerged"]):
         results["merge_keypoints"] = (
-            f"inlier matches joined as they were found: {describe_lengths(tracks['lengths_unmerged'])}; "
-            f"in merged keypoints: {describe_lengths(tracks['lengths_merged'])}"
+            f"inlier matches before merging keypoints: {describe_lengths(tracks['lengths_unmerged'])}; "
+            f"after merging: {describe_lengths(tracks['lengths_merged'])}"
         )
     stages = [stage for stage in seconds if stage not in results]
     rows = [[stage, text] for stage, text in results.items()] + [[stage, ""] for stage in stages]

@@ -75,7 +75,7 @@ def _look(
     """The likeness (P,) of pairs, and which stay (P,) bool."""
     previews = read_previews(job.paths("features"), images, options.preview_keypoints)
     likenesses = np.full(len(table.pairs), np.nan, np.float32)
-    progress = job.progress(len(likenesses), "pairs looked at")
+    progress = job.progress(len(likenesses), "pairs previewed")
     for start in range(0, len(likenesses), LOOKS_AT_ONCE):
         part = slice(start, start + LOOKS_AT_ONCE)
         likenesses[part] = look_at_pairs(
@@ -85,7 +85,7 @@ def _look(
     counts = np.array([len(preview) for preview in previews])
     few = counts < options.preview_keypoints
     if few.any():
-        print(f"{few.sum()} images have fewer than {2 * options.preview_keypoints} keypoints to look at")
+        print(f"{few.sum()} images have fewer than {2 * options.preview_keypoints} keypoints to preview")
     unsure = np.asarray(few[table.pairs].any(axis=1) & (counts[table.pairs] > 1).all(axis=1))
     stays = alike_pairs(table.pairs, likenesses, unsure, options.min_likeness, options.least_partners)
     if options.enough_partners:
@@ -134,18 +134,18 @@ def _local_places(index: ImageIndex) -> Array:
     origin = local_origin(places)
     if origin is None:
         raise ConfigError(
-            "select_pairs.method pairs images by their position, but none tells it in EXIF: "
-            "say --config 'select_pairs={method: sequential+retrieval}'."
+            "select_pairs.method pairs images by their GPS position, but none has one in EXIF: "
+            "use --config 'select_pairs={method: sequential+retrieval}'."
         )
     without = int(np.isnan(places).any(axis=1).sum())
     if without:
-        print(f"warning: {without} of {len(places)} images do not tell their position in EXIF")
+        print(f"warning: {without} of {len(places)} images have no GPS position in EXIF")
     return local_metres(places, origin)[:, :2]
 
 
 def _read_list(path: str, names: list[str], refused: list[str]) -> PairTable:
     if not path:
-        raise ConfigError("select_pairs.method is 'listed' but no list is given: say --config pairs=FILE.")
+        raise ConfigError("select_pairs.method is 'listed' but no list is given: use --config pairs=FILE.")
     try:
         lines = Path(path).expanduser().read_text("utf-8-sig").split("\n")
     except (OSError, UnicodeDecodeError) as error:
@@ -154,7 +154,7 @@ def _read_list(path: str, names: list[str], refused: list[str]) -> PairTable:
         ) from None
     table, skipped = listed_pairs(lines, names, refused, path)
     if skipped:
-        print(f"warning: {skipped} listed pairs name an image that cannot be used; they are left out")
+        print(f"warning: {skipped} listed pairs are left out: they name an image that cannot be used")
     return table
 
 
@@ -164,11 +164,11 @@ def _matched_pairs(path: str, names: list[str]) -> PairTable:
         pairs, others = read_hloc_pairs(file, names)
     if not len(pairs):
         raise ConfigError(
-            f"'{path}' has no matches of two images of this scene ({others} pairs of others): its names "
-            "must be those of the images, relative to the image folder."
+            f"'{path}' has no matches between images of this scene ({others} pairs of other images): its "
+            "image names must be relative to the image folder."
         )
     if others:
-        print(f"warning: {others} pairs of '{path}' are left out: they name an image that is not in use")
+        print(f"warning: {others} pairs of '{path}' are left out: they name an image that is not used")
     return PairTable.of(pairs, "listed")
 
 

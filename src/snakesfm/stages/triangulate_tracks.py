@@ -54,7 +54,7 @@ def run(job: StageJob) -> None:
     good = np.isfinite(points[:, 0])
     if not good.any():
         raise SceneError(
-            f"Scene '{job.scene}': none of {count} tracks meets in one point under the averaged poses: "
+            f"Scene '{job.scene}': none of {count} tracks can be triangulated with the averaged poses: "
             "check the cameras' focal lengths, or raise triangulate_tracks.max_reprojection_error_px."
         )
     lengths = np.add.reduceat(kept.astype(np.int64), tracks.offsets[:-1])[good]

@@ -52,7 +52,7 @@ def make_demo(folder: Path, options: DemoOptions) -> bool:
     if marker.is_file() and json.loads(marker.read_text("utf-8")) == content:
         return False
     if folder.exists() and not marker.is_file() and (not folder.is_dir() or any(folder.iterdir())):
-        raise ConfigError(f"{folder} holds something else than the demo scene: name a new folder.")
+        raise ConfigError(f"{folder} contains something other than the demo scene: choose a new folder.")
     folder.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix=f".{folder.name}.", dir=folder.parent) as name:
         temporary = Path(name) / "demo"

@@ -45,7 +45,7 @@ class SimulationOptions:
     def __post_init__(self) -> None:
         least = LEAST_IMAGES[self.survey]
         if self.images < least:
-            raise ConfigError(f"A survey '{self.survey}' takes at least {least} images: ask for more.")
+            raise ConfigError(f"A survey '{self.survey}' needs at least {least} images: set --images.")
         if not self.known_focal and self.until == "estimate_two_view":
             # calibrate_cameras comes before it, and the poses are those that the true camera gives
             raise ConfigError(
@@ -64,22 +64,22 @@ def parse_arguments(arguments: Sequence[str] | None) -> tuple[Path, SimulationOp
     default = SimulationOptions()
     parser = argparse.ArgumentParser(
         prog="python -m snakesfm.simulate",
-        description="Make the artifacts of a large scene of known truth.",
+        description="Make the artifacts of a large scene with known ground truth.",
     )
     add = parser.add_argument
     add("folder", type=Path, help="a new folder")
     add("--images", type=_natural, default=default.images)
     add("--survey", choices=sorted(SURVEYS), default=default.survey)
     add("--until", choices=UNTIL, default=default.until, help="the last stage that is made")
-    add("--partners", type=_natural, default=default.partners, help="near images that an image chooses")
-    add("--keypoints", type=_natural, default=default.keypoints, help="most of an image")
+    add("--partners", type=_natural, default=default.partners, help="nearby images paired with each image")
+    add("--keypoints", type=_natural, default=default.keypoints, help="largest number per image")
     add(
         "--unknown-focal",
         dest="known_focal",
         action="store_false",
         help="leave the focal length to the workflow",
     )
-    add("--blocks", type=_natural, default=default.blocks, help="0 for what the workflow chooses")
+    add("--blocks", type=_natural, default=default.blocks, help="0 lets the workflow choose")
     add("--seed", type=_natural, default=default.seed)
     given = vars(parser.parse_args(arguments))
     return given.pop("folder"), SimulationOptions(**given)
@@ -87,5 +87,5 @@ def parse_arguments(arguments: Sequence[str] | None) -> tuple[Path, SimulationOp
 
 def _natural(text: str) -> int:
     if not text.isdecimal():
-        raise argparse.ArgumentTypeError(f"'{text}' is no whole number: give 0 or more")
+        raise argparse.ArgumentTypeError(f"'{text}' is not a whole number: give 0 or more")
     return int(text)

@@ -52,7 +52,7 @@ def describe_lengths(histogram: Array) -> str:
     if count == 0:
         return "no tracks"
     mean = float(histogram @ np.arange(len(histogram))) / count
-    return f"{count:,} tracks of {mean:.2f} images on average, {100 * histogram[2] / count:.0f} % of two"
+    return f"{count:,} tracks of {mean:.2f} images on average, {100 * histogram[2] / count:.0f} % in two"
 
 
 def _ends(i: int, j: int, first: Array, second: Array) -> Array:

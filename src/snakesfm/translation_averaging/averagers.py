@@ -90,8 +90,8 @@ class TranslationRecovery:
         if share >= LEAST_SHARE_AT_ONE_SCALE:
             return centers
         print(
-            f"translation_recovery left the cameras in parts at scales of their own, the largest of "
-            f"{share:.0%}: scale_chain positions them instead"
+            f"translation_recovery left groups of cameras at different scales, the largest with "
+            f"{share:.0%} of them: scale_chain positions the cameras instead"
         )
         return chained
 

@@ -113,5 +113,5 @@ def test_unknown_cameras_are_shared_as_in_the_reference(tmp_path: Path) -> None:
 
 
 def test_a_folder_that_is_no_set_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"lacking is no image set: it needs images/ and reference/"):
+    with pytest.raises(ConfigError, match=r"lacking is not an image set: it needs images/ and reference/"):
         read_sets(tmp_path, ["lacking"])

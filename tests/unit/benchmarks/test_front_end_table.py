@@ -72,4 +72,4 @@ def test_what_is_there_is_not_measured_again(tmp_path: Path, capsys: pytest.Capt
     assert (sets, methods) == (["two"], ["x", "y"]) and not page.exists()
     assert values["two|y"] == {"found": 5} and values["one|y"] == {"failure": "broken"}
     assert table.main([*command, "--sets", "three"]) == 1
-    assert "is no image set" in capsys.readouterr().err
+    assert "is not an image set" in capsys.readouterr().err

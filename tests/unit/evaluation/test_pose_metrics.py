@@ -268,7 +268,7 @@ def test_a_real_reference_scores_against_itself_from_text_and_from_binary(data, 
 
 def test_a_folder_without_a_model_and_a_damaged_one_end_with_one_sentence(tmp_path, capsys) -> None:
     assert main([str(tmp_path), str(tmp_path)]) == 1
-    assert "holds no COLMAP model" in capsys.readouterr().err
+    assert "does not contain a COLMAP model" in capsys.readouterr().err
     for part in ("cameras", "images", "points3D"):
         (tmp_path / f"{part}.bin").write_bytes(b"\1\0\0\0\0\0\0\0nonsense")
     with pytest.raises(ConfigError, match="cannot be read"):

@@ -280,7 +280,7 @@ def test_the_world_stays_where_positions_contradict_it_or_are_not_wanted(tmp_pat
     asked = export(tmp_path / "asked", problem, georeference=True)
     summary = json.loads((asked / "summary.json").read_text())
     assert summary["georeference"] is None
-    assert any("position in EXIF" in line for line in summary["warnings"])
+    assert any("GPS in EXIF" in line for line in summary["warnings"])
 
 
 def test_images_are_one_relative_link_and_a_second_run_gives_the_same_bytes(tmp_path, problem) -> None:
@@ -334,7 +334,7 @@ def test_a_lens_of_another_distortion_is_warned_of(tmp_path, distortion: float, 
     seen = make_problem(camera_count=COUNT, point_count=3000, noise_px=0.1, camera=lens)
     summary = json.loads((export(tmp_path, seen, lost=()) / "summary.json").read_text("utf-8"))
     # the second camera has but four images
-    found = [line for line in summary["warnings"] if "has another distortion" in line]
+    found = [line for line in summary["warnings"] if "does not describe the lens" in line]
     assert len(found) == told
     assert all(line.startswith("camera 1 (SIMPLE_RADIAL)") for line in found)
 
@@ -343,7 +343,7 @@ def test_a_lens_of_another_distortion_is_warned_of(tmp_path, distortion: float, 
 def test_a_camera_that_was_reset_and_held_is_warned_of(tmp_path, problem, reset: str, told: int) -> None:
     folder = export(tmp_path, problem, reset=reset)
     summary = json.loads((folder / "summary.json").read_text("utf-8"))
-    found = [line for line in summary["warnings"] if "reset and held" in line]
+    found = [line for line in summary["warnings"] if "reset and kept fixed" in line]
     assert len(found) == told
     assert all(line.startswith("camera 2 (SIMPLE_RADIAL): its distortion was") for line in found)
 
@@ -363,7 +363,7 @@ def test_masks_go_with_the_images_where_all_have_one_of_their_size(tmp_path, pro
     assert not any("mask_path" in frame for frame in content["frames"])
     assert not (folder / "masks").exists()
     *_, warning = json.loads((folder / "summary.json").read_text("utf-8"))["warnings"]
-    assert f"1 images have none such, '{NAMES[3]}' for one" in warning
+    assert f"1 images have no mask of their own size, e.g. '{NAMES[3]}'" in warning
 
 
 def test_undistorted_images_have_pinhole_cameras_and_go_when_no_longer_asked_for(tmp_path, problem) -> None:
@@ -583,7 +583,7 @@ def test_report_says_what_happened_and_escapes_names(tmp_path, problem) -> None:
 
 def test_report_without_reference_shows_at_most_the_asked_rows(tmp_path, problem) -> None:
     page = report(tmp_path, problem, "", max_images=3)
-    assert "The 3 images with the fewest observations of 9." in page
+    assert "Only the 3 of 9 images with the fewest observations are shown." in page
     assert "relative pose AUC" not in page
 
 

@@ -108,5 +108,5 @@ def test_fisheye_images_are_warped_even_where_all_terms_are_0(
 
 
 def test_an_image_of_another_size_than_its_camera_is_named(tmp_path) -> None:
-    with pytest.raises(ImageError, match=r"a\.\w+ has 560 x 380 pixels but its camera 570 x 380: put back"):
+    with pytest.raises(ImageError, match=r"a\.\w+ has 560 x 380 pixels, but its camera 570 x 380: restore"):
         undistort(tmp_path, "SIMPLE_RADIAL", DISTORTED["SIMPLE_RADIAL"], width=560)

@@ -52,6 +52,6 @@ def test_equal_seeds_give_equal_points(open3d):
 def test_without_open3d_there_is_one_sentence(monkeypatch):
     monkeypatch.setitem(sys.modules, "open3d", None)
     with pytest.raises(
-        ConfigError, match=r"needs open3d, which cannot be loaded .* or say surface_points=0\.$"
+        ConfigError, match=r"needs open3d, which cannot be loaded .* or set surface_points to 0\.$"
     ):
         Surface(sphere(20), 10, seed=1)

@@ -138,7 +138,7 @@ def test_own_cameras_of_few_sizes_are_doubted():
 
     square = photos("a", [(760, 760)] * 6, PHONE)
     (line,) = warn(square)
-    assert line.startswith("6 images have a camera each")
+    assert line.startswith("6 images have a camera of their own")
     assert "index_images={camera_sharing: single}" in line
     assert warn(square, sharing="single") == warn(square, sharing="per_image") == []
     assert warn(square, [Camera("PINHOLE", 760, 760, (700.0 + k, 700, 380, 380)) for k in range(6)]) == []

@@ -94,18 +94,19 @@ def test_what_is_doubtful_of_cameras_is_kept_and_told(tmp_path, folder, capsys):
     assert found.camera_ids.tolist() == [0, 0, 1, 1, 1]
     assert found.camera_sources.tolist() == ["exif", "given"]
     (line,) = found.warnings
-    assert line.startswith(f"2 images that {tmp_path / 'images.txt'} lacks took camera 1 by their size")
+    start = f"2 images not listed in {tmp_path / 'images.txt'} were assigned camera 1 by their size"
+    assert line.startswith(start)
     assert f"warning: {line}" in capsys.readouterr().out.splitlines()
     found = index(tmp_path, folder, camera_sharing="exif")
     assert found.camera_ids.tolist() == [0, 0, 1, 2, 3]
-    assert [line.split(":")[0] for line in found.warnings] == ["3 images have a camera each"]
+    assert [line.split(":")[0] for line in found.warnings] == ["3 images have a camera of their own"]
     assert index(tmp_path, folder, camera_sharing="per_image").warnings.tolist() == []
 
 
 def test_too_few_images_end_with_one_sentence(tmp_path, capsys):
     images = tmp_path / "images"
     images.mkdir()
-    with pytest.raises(SceneError, match="holds no JPEG, PNG, TIFF, WebP or BMP image"):
+    with pytest.raises(SceneError, match="contains no JPEG, PNG, TIFF, WebP or BMP image"):
         index(tmp_path, images)
     (images / "text.jpg").write_text("no picture")
     with pytest.raises(SceneError, match=r"no usable image.*1 refused, first: .*text\.jpg"):

@@ -224,7 +224,7 @@ def test_cut_off_jpeg_with_a_complete_thumbnail_is_refused(tmp_path, picture):
     path.write_bytes(whole)
     read_header(path)
     path.write_bytes(whole[: len(whole) * 2 // 3])
-    assert "cut off" in refused(path)
+    assert "truncated" in refused(path)
 
 
 def test_bytes_after_the_end_are_harmless(tmp_path, picture):
@@ -238,7 +238,7 @@ def test_bytes_after_the_end_are_harmless(tmp_path, picture):
 
 def test_what_is_no_image_is_refused(tmp_path, picture):
     (tmp_path / "text.jpg").write_text("dear diary")
-    assert "no JPEG" in refused(tmp_path / "text.jpg")
+    assert "not a JPEG" in refused(tmp_path / "text.jpg")
     (tmp_path / "empty.png").touch()
     assert "is empty" in refused(tmp_path / "empty.png")
     (tmp_path / "folder.jpg").mkdir()
@@ -249,7 +249,7 @@ def test_what_is_no_image_is_refused(tmp_path, picture):
     assert "200 x 20" in refused(tmp_path / "small.png")
     save(Image.fromarray(picture), tmp_path / "animation.gif")
     (tmp_path / "animation.gif").rename(tmp_path / "animation.jpg")
-    assert "no JPEG" in refused(tmp_path / "animation.jpg")
+    assert "not a JPEG" in refused(tmp_path / "animation.jpg")
 
 
 def test_png_damaged_inside_is_refused_by_its_pixels(tmp_path, picture):

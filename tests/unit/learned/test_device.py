@@ -23,5 +23,7 @@ def test_a_device_is_chosen_as_the_run_wants_it(monkeypatch, torch, there):
 
 def test_a_missing_device_is_one_sentence(monkeypatch, torch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    with pytest.raises(ConfigError, match=r"finds no CUDA device: ask .*slurm-gpu.* or say device=cpu\.$"):
+    with pytest.raises(
+        ConfigError, match=r"finds no CUDA device: request .*slurm-gpu.* or set device=cpu\.$"
+    ):
         device.use_device("cuda")

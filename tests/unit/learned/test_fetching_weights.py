@@ -99,9 +99,7 @@ def test_no_internet_gives_one_sentence(monkeypatch, tmp_path, folder, capsys):
     declare(monkeypatch, url=(tmp_path / "nowhere").as_uri())
     assert main([str(folder), "net"]) == 1
     error = capsys.readouterr().err
-    assert (
-        error.count("\n") == 1 and "where there is internet" in error and str(folder / "net.bin") in error
-    )
+    assert error.count("\n") == 1 and "with internet access" in error and str(folder / "net.bin") in error
     assert main([str(folder)]) == 0
     assert "no weights" in capsys.readouterr().out
 

@@ -41,7 +41,7 @@ def counts(**changes: object) -> ImageCounts:
 @pytest.mark.parametrize(
     ("changes", "expected"),
     [
-        ({"pairs": [0, 5, 5]}, "No pair with it"),
+        ({"pairs": [0, 5, 5]}, "No pair with this image"),
         (
             {"accepted": [0, 4, 4]},
             "None of its 5 pairs was accepted: low inlier ratio (2), too few inliers (3).",
@@ -49,10 +49,10 @@ def counts(**changes: object) -> ImageCounts:
         ({"kept": [0, 3, 3]}, "All its 4 view-graph edges were refused: cycle min (4)."),
         ({"components": [2, 0, 0]}, "component of 1 images"),
         ({"rotated": [False, True, True]}, "no rotation"),
-        ({"track_observations": [0, 9, 9]}, "No track"),
+        ({"track_observations": [0, 9, 9]}, "in no track"),
         ({"point_observations": [0, 8, 8]}, "triangulated"),
         ({}, "Bundle adjustment dropped it"),
-        ({"models": [1, 0, 0], "components": [1, 0, 0]}, "model of its own of 1 images, in sparse/1"),
+        ({"models": [1, 0, 0], "components": [1, 0, 0]}, "separate model of 1 images, in sparse/1"),
         ({"models": [0, 0, 0]}, ""),
     ],
 )

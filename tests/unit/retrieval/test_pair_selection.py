@@ -147,7 +147,7 @@ def test_listed_pairs_with_a_refused_image_are_skipped():
     ("line", "words"),
     [
         ("img1.jpg img22.jpg", ["pairs.txt:2", "'img22.jpg'", "did you mean 'img2.jpg'"]),
-        ("img1.jpg", ["pairs.txt:2", "no pair"]),
+        ("img1.jpg", ["pairs.txt:2", "not a pair"]),
         ("img1.jpg img2.jpg extra", ["pairs.txt:2", "tab"]),
         ("img1.jpg\tzzz", ["pairs.txt:2", "'zzz'", "relative to the image folder"]),
     ],

@@ -187,8 +187,8 @@ def test_equal_seeds_give_equal_bytes_and_another_seed_is_rendered_anew(demo, tm
 
 def test_a_folder_with_something_else_is_left_alone(tmp_path, capsys) -> None:
     (tmp_path / "mine.txt").write_text("keep", "utf-8")
-    with pytest.raises(ConfigError, match="name a new folder"):
+    with pytest.raises(ConfigError, match="choose a new folder"):
         make_demo(tmp_path, SMALL)
     assert main([str(tmp_path)]) == 1
-    assert "name a new folder" in capsys.readouterr().err
+    assert "choose a new folder" in capsys.readouterr().err
     assert (tmp_path / "mine.txt").read_text("utf-8") == "keep"

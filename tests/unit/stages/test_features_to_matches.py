@@ -319,11 +319,11 @@ def test_the_pairs_of_a_file_of_matches_are_followed(dealt, tmp_path, capsys):
     with h5py.File(path, "w") as file:
         file["images/a/1.png/matches0"] = np.array([-1])
     with pytest.raises(
-        ConfigError, match=r"matches\.h5' has no matches of two images of this scene \(1 pairs"
+        ConfigError, match=r"matches\.h5' has no matches between images of this scene \(1 pairs"
     ):
         dealt.select(SelectPairsOptions(), str(path))
     path.write_bytes(b"no HDF5 file")
-    with pytest.raises(ConfigError, match="no HDF5 file"):
+    with pytest.raises(ConfigError, match="not an HDF5 file"):
         dealt.select(SelectPairsOptions(), str(path))
 
 
@@ -464,7 +464,7 @@ def test_a_mask_of_another_shape_is_refused(images, tmp_path):
     masks.mkdir()
     cv2.imwrite(str(masks / "other.png.png"), np.zeros((320, 240), np.uint8))
     scene = Scene(tmp_path, images, 1)
-    with pytest.raises(ConfigError, match=r"other\.png\.png has 240 x 320 pixels but its image 320 x 240"):
+    with pytest.raises(ConfigError, match=r"other\.png\.png has 240 x 320 pixels, but its image 320 x 240"):
         scene.extract(masks=str(masks))
     (masks / "other.png.png").write_bytes(b"\x89PNG no image")
     with pytest.raises(ConfigError, match=r"A mask cannot be used: .*other\.png\.png"):

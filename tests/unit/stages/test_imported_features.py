@@ -73,14 +73,14 @@ def test_keypoints_of_larger_or_smaller_photographs_are_scaled(extract, capsys, 
 
 @pytest.mark.parametrize("seen", [(HEIGHT, WIDTH), (WIDTH, HEIGHT - 10), (2 * WIDTH, HEIGHT)])
 def test_keypoints_of_a_photograph_with_another_aspect_are_refused(extract, seen):
-    words = rf"'a\.png' in an image of {seen[0]} x {seen[1]} pixels, but .* stores {WIDTH} x {HEIGHT}"
+    words = rf"'a\.png' from an image of {seen[0]} x {seen[1]} pixels, but .* has {WIDTH} x {HEIGHT}"
     with pytest.raises(ConfigError, match=words):
         extract({"a.png": keypoints(image_size=seen)})
 
 
 @pytest.mark.parametrize("seen", [[0, 0], [WIDTH], [np.nan, 10]])
 def test_an_image_size_that_is_none_is_refused(extract, seen):
-    with pytest.raises(ConfigError, match=r"image_size of 'a\.png' that is no width and height"):
+    with pytest.raises(ConfigError, match=r"image_size for 'a\.png' that is not a width"):
         extract({"a.png": keypoints(image_size=seen)})
 
 
@@ -92,12 +92,12 @@ def test_images_without_descriptors_or_keypoints_go_with_the_others(extract, cap
     assert not found.descriptors[:4].any()
     np.testing.assert_allclose(found.descriptors[4:], keypoints()["descriptors"].T, atol=1e-2)
     warnings = [line for line in capsys.readouterr().out.splitlines() if line.startswith("warning")]
-    assert len(warnings) == 1 and "has no descriptors of 'a.png'" in warnings[0]
+    assert len(warnings) == 1 and "has no descriptors for 'a.png'" in warnings[0]
 
 
 def test_descriptors_of_two_lengths_are_refused(extract):
     other = keypoints(descriptors=np.ones((32, 5)))
-    with pytest.raises(ConfigError, match=r"of 32 numbers of 'b\.png', but of 16 of other images"):
+    with pytest.raises(ConfigError, match=r"of length 32 for 'b\.png', but of 16 for other images"):
         extract({"a.png": keypoints(), "b.png": other})
 
 

@@ -110,7 +110,7 @@ def test_a_part_without_centres_is_no_model(scene, tmp_path, capsys):
     options = AdjustBundleOptions(refine_keypoints=False)
     run(adjust_bundle, options, inputs, tmp_path / "model.h5", intrinsics="fixed", images="")
     told = [line for line in capsys.readouterr().out.splitlines() if "left out" in line]
-    assert told == [f"part 1 is left out: 0 of its {LARGE} images have a pose, and a model takes 2"]
+    assert told == [f"part 1 is left out: 0 of its {LARGE} images have a pose, and a model needs 2"]
     model = Reconstruction.read(tmp_path / "model.h5")
     np.testing.assert_array_equal(model.models, np.where(PART, -1, 0))
     assert len(model.points) > 100
@@ -175,7 +175,7 @@ def test_models_are_exported_side_by_side_and_the_first_is_evaluated(made, scene
         assert 0.1 < model.compute_mean_reprojection_error() < 0.6
     summary = json.loads((tmp_path / "summary.json").read_text("utf-8"))
     assert (summary["registered_images"], summary["images_in_other_models"]) == (LARGE, [SMALL])
-    assert summary["not_registered"] == [] and f"{SMALL} images have no tie" in summary["warnings"][0]
+    assert summary["not_registered"] == [] and f"{SMALL} images could not be" in summary["warnings"][0]
     run(evaluate_model, EvaluateModelOptions(), scene, tmp_path / "metrics.json", **settings)
     metrics = json.loads((tmp_path / "metrics.json").read_text("utf-8"))
     assert (metrics["registered_images"], metrics["images_in_other_models"]) == (LARGE, SMALL)

@@ -117,7 +117,8 @@ def test_cameras_that_were_reset_are_told_of(made, inputs, tmp_path, capsys, mos
     assert (model.camera_params[0, 0] == made.cameras[0].params[0]) == bool(told)
     lines = [line for line in capsys.readouterr().out.splitlines() if "cameras reset" in line]
     names = ["round 1", "round 2", "round 3", "registration", "last pass"] if told else []
-    assert lines == [f"{name}: cameras reset as their focal length was not plausible: 1" for name in names]
+    cause = "cameras reset because their focal length was implausible"
+    assert lines == [f"{name}: {cause}: 1" for name in names]
 
 
 def test_larger_photographs_give_the_same_model(made, inputs, tmp_path):

@@ -233,7 +233,7 @@ def test_memory_does_not_grow_with_the_number_of_blocks(tmp_path: Path) -> None:
 def test_a_folder_in_use_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "photo.jpg").touch()
     assert main([str(tmp_path), "--images", "10"]) == 1
-    assert "is not empty: name a new folder" in capsys.readouterr().err
+    assert "is not empty: choose a new folder" in capsys.readouterr().err
     assert main([str(tmp_path / "new"), "--images", "10", "--survey", "street"]) == 1
     assert "at least 320 images" in capsys.readouterr().err
 
@@ -246,7 +246,7 @@ def test_numbers_that_are_none_are_refused(
     with pytest.raises(SystemExit) as caught:
         main([str(tmp_path / "new"), "--images", "10", option, value])
     assert caught.value.code == 2
-    assert f"{option}: '{value}' is no whole number: give 0 or more" in capsys.readouterr().err
+    assert f"{option}: '{value}' is not a whole number: give 0 or more" in capsys.readouterr().err
     assert not (tmp_path / "new").exists()
 
 

@@ -23,8 +23,8 @@ def test_merging_joins_what_every_pair_finds_at_another_place():
     unmerged, merged = compare_track_lengths(keypoints, pairs, offsets, matches, lambda i, j: found[i, j])
     np.testing.assert_array_equal(unmerged, [0, 0, points * len(pairs)])
     np.testing.assert_array_equal(merged, [0, 0, 0, 0, 0, points])
-    assert describe_lengths(unmerged) == "400 tracks of 2.00 images on average, 100 % of two"
-    assert describe_lengths(merged) == "40 tracks of 5.00 images on average, 0 % of two"
+    assert describe_lengths(unmerged) == "400 tracks of 2.00 images on average, 100 % in two"
+    assert describe_lengths(merged) == "40 tracks of 5.00 images on average, 0 % in two"
 
 
 def test_places_that_pairs_share_join_without_merging():

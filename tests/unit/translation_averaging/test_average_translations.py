@@ -366,7 +366,7 @@ def test_recovery_in_parts_at_scales_of_their_own_gives_way_to_the_chain(reject_
     averager = TranslationRecovery(reject_outliers=reject_outliers)
     found = averager.position(problem, 0)
     np.testing.assert_array_equal(found, ScaleChain().position(problem, 0))
-    assert "scale_chain positions them instead" in capsys.readouterr().out
+    assert "scale_chain positions the cameras instead" in capsys.readouterr().out
     assert np.median(errors(found, truth.centers)) < 0.01 * np.ptp(truth.centers, axis=0).max()
 
 
