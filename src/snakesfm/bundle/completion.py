@@ -3,12 +3,11 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import cv2  # noqa: F401 - must be loaded before pycolmap, whose PNG library clashes otherwise
 import numpy as np
-import pycolmap
 from numpy.typing import NDArray
 
 from snakesfm.bundle.reading import observations_of
+from snakesfm.geometry.colmap_binding import pycolmap
 
 Array = NDArray[Any]
 

@@ -2,14 +2,13 @@
 
 from typing import Any
 
-import cv2  # noqa: F401 - must be loaded before pycolmap, whose PNG library clashes otherwise
 import gtsam
 import numpy as np
-import pycolmap
 
 from snakesfm.bundle.interface import SolverSettings
 from snakesfm.bundle.reading import observations_of
 from snakesfm.errors import ConfigError
+from snakesfm.geometry.colmap_binding import pycolmap
 from snakesfm.geometry.poses import to_rigid3d
 
 TIGHT, FREE = 1e-6, 1e6

@@ -4,7 +4,6 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-import pycolmap
 from numpy.typing import NDArray
 
 from snakesfm.bundle.alignment import (
@@ -14,6 +13,7 @@ from snakesfm.bundle.alignment import (
     choose_templates,
 )
 from snakesfm.bundle.reading import observations_of, observed_keypoints
+from snakesfm.geometry.colmap_binding import pycolmap
 from snakesfm.grouping import rows_of_each
 
 Array = NDArray[Any]

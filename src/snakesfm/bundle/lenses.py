@@ -3,15 +3,14 @@
 from collections.abc import Collection
 from typing import Any
 
-import cv2  # noqa: F401 - must be loaded before pycolmap, whose PNG library clashes otherwise
 import numpy as np
-import pycolmap
 from numpy.typing import NDArray
 
 from snakesfm.bundle.interface import BundleAdjuster, SolverSettings
 from snakesfm.bundle.principal_points import shared_cameras
 from snakesfm.bundle.reading import observations_of, observed_keypoints
 from snakesfm.geometry.camera import Camera
+from snakesfm.geometry.colmap_binding import pycolmap
 from snakesfm.geometry.lens_fit import MAX_MISFIT, LensFit, fit_lenses
 from snakesfm.grouping import rows_of_each
 

@@ -4,13 +4,12 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-import cv2  # noqa: F401 - must be loaded before pycolmap, whose PNG library clashes otherwise
 import numpy as np
-import pycolmap
 from numpy.typing import NDArray
 
 from snakesfm.bundle.reading import observations_of
 from snakesfm.bundle.resection import resect
+from snakesfm.geometry.colmap_binding import pycolmap
 
 Array = NDArray[Any]
 

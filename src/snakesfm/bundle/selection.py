@@ -4,15 +4,14 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
-import cv2  # noqa: F401 - must be loaded before pycolmap, whose PNG library clashes otherwise
 import numpy as np
-import pycolmap
 from numpy.typing import NDArray
 
 from snakesfm.bundle.interface import BundleAdjuster, SolverSettings
 from snakesfm.bundle.model import BundleModel, to_reconstruction
 from snakesfm.bundle.reading import observations_of, observed_keypoints
 from snakesfm.geometry.camera import Camera
+from snakesfm.geometry.colmap_binding import pycolmap
 from snakesfm.grouping import rows_of_each
 
 Array = NDArray[Any]

@@ -4,9 +4,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import cv2  # noqa: F401 - must be loaded before pycolmap, whose PNG library clashes otherwise
 import numpy as np
-import pycolmap
 
 from snakesfm.artifacts.gather import gather_image_columns, gather_inlier_matches, gather_refused_pairs
 from snakesfm.artifacts.images import CalibratedCameras, ImageIndex
@@ -31,6 +29,7 @@ from snakesfm.bundle.rounds import adjust_rounds
 from snakesfm.bundle.wild_cameras import WildCause
 from snakesfm.errors import SceneError
 from snakesfm.geometry.camera import cameras_from_columns, cameras_to_columns
+from snakesfm.geometry.colmap_binding import pycolmap
 from snakesfm.geometry.detector_pixels import (
     detector_scales,
     reduce_all_keypoints,
