@@ -102,7 +102,7 @@ def run_rounds(made, model, solving=None, **changes):
         RoundSettings(**changes),
         records.append,
     )
-    return from_reconstruction(reconstruction, model), records
+    return from_reconstruction(reconstruction, model)[0], records
 
 
 def side_by_side(first, second):

@@ -61,7 +61,7 @@ class BundleAdjusterContract:
         before, after = adjust(
             reconstruction, SolverSettings(constant_cameras=frozenset([1]), function_tolerance=1e-12)
         )
-        result = from_reconstruction(reconstruction, model)
+        result, _ = from_reconstruction(reconstruction, model)
         assert after < 1e-3 < before
         assert errors_px(result, made).max() < 0.02
         assert relative_rotation_error_deg(result, made).max() < 0.01
@@ -70,7 +70,7 @@ class BundleAdjusterContract:
     def test_noise_leaves_errors_of_its_size(self, adjust):
         made, model, reconstruction = scene(noise_px=0.5)
         adjust(reconstruction, SolverSettings(constant_cameras=frozenset([1])))
-        result = from_reconstruction(reconstruction, model)
+        result, _ = from_reconstruction(reconstruction, model)
         assert 0.3 < errors_px(result, made).mean() < 0.7
         assert 1e-3 < relative_rotation_error_deg(result, made).mean() < 0.4
 
@@ -80,7 +80,7 @@ class BundleAdjusterContract:
         for kind in (loss, "squared"):
             made, model, reconstruction = scene(noise_px=0.3, outlier_ratio=0.04)
             adjust(reconstruction, SolverSettings(loss=kind, constant_cameras=frozenset([1])))
-            result = from_reconstruction(reconstruction, model)
+            result, _ = from_reconstruction(reconstruction, model)
             means[kind] = relative_rotation_error_deg(result, made).mean()
         assert 1e-3 < means[loss] < 0.5 and means[loss] < 0.5 * means["squared"]
 
@@ -101,7 +101,7 @@ class BundleAdjusterContract:
     def test_intrinsics_are_refined_with_the_principal_point_held(self, adjust, camera, start):
         made, model, reconstruction = scene(camera=camera, start=start)
         adjust(reconstruction, SolverSettings(function_tolerance=1e-10))
-        result = from_reconstruction(reconstruction, model)
+        result, _ = from_reconstruction(reconstruction, model)
         np.testing.assert_allclose(result.cameras[0].params, camera.params, rtol=2e-3, atol=2e-3)
         assert errors_px(result, made).mean() < 0.05
 
@@ -110,7 +110,7 @@ class BundleAdjusterContract:
         before, after = adjust(
             reconstruction, SolverSettings(constant_cameras=frozenset([1]), constant_rotations=True)
         )
-        result = from_reconstruction(reconstruction, model)
+        result, _ = from_reconstruction(reconstruction, model)
         assert after < before
         np.testing.assert_allclose(result.rotations, model.rotations, atol=1e-5)
 
@@ -137,7 +137,7 @@ class BundleAdjusterContract:
         for _ in range(2):
             _, model, reconstruction = scene(noise_px=0.5)
             adjust(reconstruction, SolverSettings())
-            results.append(from_reconstruction(reconstruction, model))
+            results.append(from_reconstruction(reconstruction, model)[0])
         np.testing.assert_array_equal(results[0].rotations, results[1].rotations)
         np.testing.assert_array_equal(results[0].points, results[1].points)
 
@@ -150,7 +150,7 @@ class TestCeres(BundleAdjusterContract):
         for threads in (1, 2):
             _, model, reconstruction = scene(noise_px=0.5)
             adjust(reconstruction, SolverSettings(threads=threads))
-            results.append(from_reconstruction(reconstruction, model))
+            results.append(from_reconstruction(reconstruction, model)[0])
         np.testing.assert_array_equal(results[0].rotations, results[1].rotations)
 
 

@@ -88,6 +88,27 @@ def test_domains_import_no_stage_no_artifact_and_no_workflow(file: Path) -> None
     assert not wrong
 
 
+def loads(node: ast.AST, package: str) -> bool:
+    """Whether code imports a package when it runs; ``if TYPE_CHECKING:`` does not."""
+    if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING":
+        return any(loads(child, package) for child in node.orelse)
+    if isinstance(node, ast.Import):
+        return any(alias.name.split(".")[0] == package for alias in node.names)
+    if isinstance(node, ast.ImportFrom):
+        return not node.level and (node.module or "").split(".")[0] == package
+    return any(loads(child, package) for child in ast.iter_child_nodes(node))
+
+
+def test_pycolmap_is_imported_in_one_place_after_cv2(root: Path) -> None:
+    source = root / "src" / "snakesfm"
+    loading = {
+        str(file.relative_to(source))
+        for file in source.rglob("*.py")
+        if loads(ast.parse(file.read_text()), "pycolmap")
+    }
+    assert loading == {"geometry/colmap_binding.py"}
+
+
 def test_snakefile_is_a_table_of_contents(root: Path) -> None:
     lines = (root / "Snakefile").read_text().splitlines()
     included = {line.split("/")[-1][:-1] for line in lines if line.startswith("include:")}

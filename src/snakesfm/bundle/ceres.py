@@ -1,9 +1,7 @@
 """Bundle adjustment by Ceres, through pycolmap."""
 
-import cv2  # noqa: F401 - must be loaded before pycolmap, whose PNG library clashes otherwise
-import pycolmap
-
 from snakesfm.bundle.interface import SolverSettings
+from snakesfm.geometry.colmap_binding import pycolmap
 
 INNER_TOLERANCE = 0.1
 FACTORED_IMAGES = 5000

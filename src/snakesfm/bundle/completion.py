@@ -3,12 +3,11 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import cv2  # noqa: F401 - must be loaded before pycolmap, whose PNG library clashes otherwise
 import numpy as np
-import pycolmap
 from numpy.typing import NDArray
 
-from snakesfm.bundle.reading import observations_of
+from snakesfm.bundle.reading import read_tracks
+from snakesfm.geometry.colmap_binding import pycolmap
 
 Array = NDArray[Any]
 
@@ -46,13 +45,13 @@ def drop_repeated_observations(reconstruction: pycolmap.Reconstruction) -> int:
 
     pycolmap's completion and merging do not prevent them, notably where SIFT gave one place twice.
     """
-    ids = sorted(reconstruction.point3D_ids())
-    _, points, images, rows = observations_of(reconstruction)
+    tracks = read_tracks(reconstruction)
+    points, images, rows = tracks.ids[tracks.point_rows], tracks.images, tracks.rows
     order = np.lexsort((rows, images, points))
     again = (np.diff(points[order]) == 0) & (np.diff(images[order]) == 0)
     repeated = order[1:][again]
     for row in repeated.tolist():
-        if reconstruction.exists_point3D(ids[points[row]]):
+        if reconstruction.exists_point3D(int(points[row])):
             reconstruction.delete_observation(int(images[row]) + 1, int(rows[row]))
     return len(repeated)
 

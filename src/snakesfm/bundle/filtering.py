@@ -4,8 +4,7 @@ import heapq
 from collections import Counter
 from collections.abc import Collection
 
-import cv2  # noqa: F401 - must be loaded before pycolmap, whose PNG library clashes otherwise
-import pycolmap
+from snakesfm.geometry.colmap_binding import pycolmap
 
 
 def filter_observations(

@@ -9,12 +9,10 @@ not, as of anamorphic video, the images tell.
 from collections.abc import Collection, Sequence
 from dataclasses import replace
 
-import cv2  # noqa: F401 - must be loaded before pycolmap, whose PNG library clashes otherwise
-import pycolmap
-
 from snakesfm.bundle.interface import BundleAdjuster, SolverSettings
 from snakesfm.bundle.lenses import set_camera
 from snakesfm.geometry.camera import Camera
+from snakesfm.geometry.colmap_binding import pycolmap
 
 ONE_FOCAL_MODELS = {
     "PINHOLE": "SIMPLE_PINHOLE",

@@ -2,14 +2,13 @@
 
 from typing import Any
 
-import cv2  # noqa: F401 - must be loaded before pycolmap, whose PNG library clashes otherwise
 import gtsam
 import numpy as np
-import pycolmap
 
 from snakesfm.bundle.interface import SolverSettings
-from snakesfm.bundle.reading import observations_of
+from snakesfm.bundle.reading import read_tracks_and_pixels
 from snakesfm.errors import ConfigError
+from snakesfm.geometry.colmap_binding import pycolmap
 from snakesfm.geometry.poses import to_rigid3d
 
 TIGHT, FREE = 1e-6, 1e6
@@ -37,20 +36,20 @@ def adjust_gtsam(reconstruction: pycolmap.Reconstruction, settings: SolverSettin
     priors = gtsam.NonlinearFactorGraph()
     for camera_id in sorted({reconstruction.image(i).camera_id for i in images}):
         _add_calibration(reconstruction.camera(camera_id), camera_id, held, settings, priors, values)
-    points, point_rows, image_rows, rows = observations_of(reconstruction)
-    for row, point in enumerate(points):
+    tracks, pixels = read_tracks_and_pixels(reconstruction)
+    for row, point in enumerate(tracks.points):
         values.insert(_point(row), point)
     noise = _noise(settings)
-    for point, image_row, row in zip(point_rows.tolist(), image_rows.tolist(), rows.tolist(), strict=True):
-        image = reconstruction.image(image_row + 1)
-        camera_id = image.camera_id
+    for point, image_row, pixel in zip(
+        tracks.point_rows.tolist(), tracks.images.tolist(), pixels, strict=True
+    ):
+        camera_id = reconstruction.image(image_row + 1).camera_id
         camera = reconstruction.camera(camera_id)
-        pixel = np.array(image.point2D(row).xy)
-        factor = _factor(camera.model_name)
+        measured, factor = pixel, _factor(camera.model_name)
         if camera_id in held:
             undistorted = camera.cam_from_img(pixel)
-            pixel, factor = undistorted * camera.mean_focal_length(), gtsam.GeneralSFMFactor2Cal3_S2
-        graph.add(factor(pixel, noise, _pose(image_row + 1), _point(point), _calibration(camera_id)))
+            measured, factor = undistorted * camera.mean_focal_length(), gtsam.GeneralSFMFactor2Cal3_S2
+        graph.add(factor(measured, noise, _pose(image_row + 1), _point(point), _calibration(camera_id)))
     before = float(graph.error(values))
     _fix_gauge(priors, values, images, settings)
     graph.push_back(priors)

@@ -4,7 +4,6 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-import pycolmap
 from numpy.typing import NDArray
 
 from snakesfm.bundle.alignment import (
@@ -13,7 +12,8 @@ from snakesfm.bundle.alignment import (
     align_observations,
     choose_templates,
 )
-from snakesfm.bundle.reading import observations_of, observed_keypoints
+from snakesfm.bundle.reading import read_tracks_and_pixels
+from snakesfm.geometry.colmap_binding import pycolmap
 from snakesfm.grouping import rows_of_each
 
 Array = NDArray[Any]
@@ -55,12 +55,12 @@ def refine_keypoints(
     -------
     How many observations were aligned or are templates, and how many there are.
     """
-    points, point_of, images, rows = observations_of(reconstruction)
+    tracks, pixels = read_tracks_and_pixels(reconstruction)
+    point_of, images, rows = tracks.point_rows, tracks.images, tracks.rows
     if not len(images):
         return 0, 0
-    offsets = np.searchsorted(point_of, np.arange(len(points) + 1))
-    pixels = observed_keypoints(reconstruction, images, rows)
-    directions, sizes, tangents = _views(reconstruction, points, point_of, images, offsets)
+    offsets = np.searchsorted(point_of, np.arange(len(tracks.points) + 1))
+    directions, sizes, tangents = _views(reconstruction, tracks.points, point_of, images, offsets)
     inside = _patch_inside(reconstruction, images, pixels, gray_scales, settings.radius_px)
     chosen = choose_templates(directions, sizes, inside, offsets)
     moved, aligned = align_observations(

@@ -3,15 +3,14 @@
 from collections.abc import Collection
 from typing import Any
 
-import cv2  # noqa: F401 - must be loaded before pycolmap, whose PNG library clashes otherwise
 import numpy as np
-import pycolmap
 from numpy.typing import NDArray
 
 from snakesfm.bundle.interface import BundleAdjuster, SolverSettings
 from snakesfm.bundle.principal_points import shared_cameras
-from snakesfm.bundle.reading import observations_of, observed_keypoints
+from snakesfm.bundle.reading import read_tracks_and_pixels
 from snakesfm.geometry.camera import Camera
+from snakesfm.geometry.colmap_binding import pycolmap
 from snakesfm.geometry.lens_fit import MAX_MISFIT, LensFit, fit_lenses
 from snakesfm.grouping import rows_of_each
 
@@ -67,15 +66,14 @@ def set_camera(reconstruction: pycolmap.Reconstruction, camera_id: int, camera: 
 def _fits(reconstruction: pycolmap.Reconstruction, camera_ids: Collection[int]) -> dict[int, LensFit]:
     if not camera_ids:
         return {}
-    points, point_of, images, rows = observations_of(reconstruction)
-    camera_of, in_camera = np.empty(len(images), dtype=np.int64), np.empty((len(images), 3))
-    for image, mine in rows_of_each(images):
+    tracks, pixels = read_tracks_and_pixels(reconstruction)
+    camera_of, in_camera = np.empty(len(pixels), dtype=np.int64), np.empty((len(pixels), 3))
+    for image, mine in rows_of_each(tracks.images):
         shot = reconstruction.image(image + 1)
         camera_of[mine] = shot.camera_id
-        in_camera[mine] = shot.cam_from_world() * points[point_of[mine]]
-    keypoints = observed_keypoints(reconstruction, images, rows)
+        in_camera[mine] = shot.cam_from_world() * tracks.points[tracks.point_rows[mine]]
     cameras = {camera_id: Camera.of_pycolmap(reconstruction.camera(camera_id)) for camera_id in camera_ids}
-    return fit_lenses(cameras, camera_of, images, in_camera, keypoints)
+    return fit_lenses(cameras, camera_of, tracks.images, in_camera, pixels)
 
 
 def _as_fisheye(camera: pycolmap.Camera) -> Camera:

@@ -4,21 +4,19 @@ Ids of cameras, images and frames in the reconstruction are rows plus one.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
-import cv2  # noqa: F401 - must be loaded before pycolmap, whose PNG library clashes otherwise
 import numpy as np
-import pycolmap
 from numpy.typing import NDArray
 
-from snakesfm.bundle.reading import observations_of
+from snakesfm.bundle.reading import read_tracks_and_pixels
 from snakesfm.geometry.camera import Camera, observation_errors
+from snakesfm.geometry.colmap_binding import pycolmap
+from snakesfm.geometry.colmap_writing import with_observations
 from snakesfm.geometry.poses import to_rigid3d
 
 Array = NDArray[Any]
-
-POINTS_AT_ONCE = 10_000
 
 
 @dataclass(frozen=True)
@@ -50,6 +48,24 @@ class BundleModel:
         return np.asarray(np.isfinite(self.rotations[:, 0, 0]) & np.isfinite(self.translations[:, 0]))
 
 
+def restrict_to(model: BundleModel, images: Array) -> BundleModel:
+    """Poses and observations of some images (N,) bool, and the points that two of them observe."""
+    kept = images[model.image_ids]
+    point_of = np.repeat(np.arange(len(model.points)), np.diff(model.offsets))
+    counts = np.bincount(point_of[kept], minlength=len(model.points))
+    kept &= counts[point_of] >= 2
+    lengths = counts[counts >= 2]
+    return replace(
+        model,
+        rotations=np.where(images[:, None, None], model.rotations, np.nan),
+        translations=np.where(images[:, None], model.translations, np.nan),
+        points=model.points[counts >= 2],
+        offsets=np.r_[0, np.cumsum(lengths)].astype(np.int64),
+        image_ids=model.image_ids[kept],
+        keypoint_ids=model.keypoint_ids[kept],
+    )
+
+
 def to_reconstruction(
     model: BundleModel, keypoints: Sequence[Array], names: Sequence[str], images: Array | None = None
 ) -> pycolmap.Reconstruction:
@@ -62,38 +78,35 @@ def to_reconstruction(
     names : of the images.
     images : (N,) bool, those that take part, registered or not; all if None.
     """
-    reconstruction = pycolmap.Reconstruction()
-    for row, camera in enumerate(model.cameras):
-        reconstruction.add_camera_with_trivial_rig(camera.to_pycolmap(row + 1))
+    taking_part = np.ones(len(names), dtype=bool) if images is None else images
     posed = model.registered
-    for row in range(len(names)) if images is None else np.flatnonzero(images).tolist():
-        image = pycolmap.Image(
-            name=str(names[row]),
-            camera_id=int(model.camera_ids[row]) + 1,
-            image_id=row + 1,
-            keypoints=keypoints[row].astype(np.float64),
-        )
-        if posed[row]:
-            pose = to_rigid3d(model.rotations[row], model.translations[row])
-            reconstruction.add_image_with_trivial_frame(image, pose)
-        else:
-            reconstruction.add_image_with_trivial_frame(image)
-    usable = posed[model.image_ids]
-    for first in range(0, len(model.points), POINTS_AT_ONCE):
-        # numbers of Python take several times the memory of the arrays
-        bounds = model.offsets[first : first + POINTS_AT_ONCE + 1]
-        part = slice(int(bounds[0]), int(bounds[-1]))
-        images, rows = (model.image_ids[part] + 1).tolist(), model.keypoint_ids[part].tolist()
-        kept, offsets = usable[part].tolist(), (bounds - bounds[0]).tolist()
-        for point, start, end in zip(model.points[first:], offsets[:-1], offsets[1:], strict=False):
-            track = [pycolmap.TrackElement(images[k], rows[k]) for k in range(start, end) if kept[k]]
-            if len(track) >= 2:
-                reconstruction.add_point3D(point, pycolmap.Track(track))
+
+    def image(row: int, **more: Array) -> pycolmap.Image:
+        camera_id = int(model.camera_ids[row]) + 1
+        return pycolmap.Image(name=str(names[row]), camera_id=camera_id, image_id=row + 1, **more)
+
+    poses = pycolmap.Reconstruction()
+    for row, camera in enumerate(model.cameras):
+        poses.add_camera_with_trivial_rig(camera.to_pycolmap(row + 1))
+    for row in np.flatnonzero(taking_part & posed).tolist():
+        pose = to_rigid3d(model.rotations[row], model.translations[row])
+        poses.add_image_with_trivial_frame(image(row), pose)
+    seen = restrict_to(model, posed)
+    reconstruction = with_observations(
+        poses, keypoints, seen.points, seen.offsets, seen.image_ids, seen.keypoint_ids
+    )
+    # files hold images with a pose alone
+    for row in np.flatnonzero(taking_part & ~posed).tolist():
+        reconstruction.add_image_with_trivial_frame(image(row, keypoints=keypoints[row].astype(np.float64)))
     return reconstruction
 
 
-def from_reconstruction(reconstruction: pycolmap.Reconstruction, model: BundleModel) -> BundleModel:
-    """The reconstruction as arrays; points sorted by their first observation, observations by image.
+def from_reconstruction(
+    reconstruction: pycolmap.Reconstruction, model: BundleModel
+) -> tuple[BundleModel, Array]:
+    """The reconstruction as arrays, and the keypoints (L,2) float64 that are observations, in pixels.
+
+    Points are sorted by their first observation, and observations by image.
 
     Parameters
     ----------
@@ -110,24 +123,25 @@ def from_reconstruction(reconstruction: pycolmap.Reconstruction, model: BundleMo
         pose = reconstruction.image(image_id).cam_from_world()
         rotations[image_id - 1] = pose.rotation.matrix()
         translations[image_id - 1] = pose.translation
-    points, point_rows, images, rows = observations_of(reconstruction)
-    order = np.lexsort((rows, images, point_rows))
-    point_rows, images, rows = point_rows[order], images[order], rows[order]
-    offsets = np.searchsorted(point_rows, np.arange(len(points) + 1))
+    tracks, pixels = read_tracks_and_pixels(reconstruction)
+    order = np.lexsort((tracks.rows, tracks.images, tracks.point_rows))
+    images, rows = tracks.images[order], tracks.rows[order]
+    offsets = np.searchsorted(tracks.point_rows, np.arange(len(tracks.points) + 1))
     rank = np.lexsort((rows[offsets[:-1]], images[offsets[:-1]]))
     lengths = np.diff(offsets)[rank]
     sorted_offsets = np.r_[0, np.cumsum(lengths)].astype(np.int64)
     take = np.repeat(offsets[:-1][rank] - sorted_offsets[:-1], lengths) + np.arange(len(rows))
-    return BundleModel(
+    result = BundleModel(
         cameras,
         model.camera_ids,
         rotations,
         translations,
-        points[rank],
+        tracks.points[rank],
         sorted_offsets,
         images[take].astype(np.int32),
         rows[take].astype(np.int32),
     )
+    return result, pixels[order][take]
 
 
 def reprojection_errors(model: BundleModel, keypoints: Array) -> Array:

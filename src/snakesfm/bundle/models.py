@@ -14,24 +14,6 @@ from snakesfm.view_graph.components import label_components
 Array = NDArray[Any]
 
 
-def restrict_to(model: BundleModel, images: Array) -> BundleModel:
-    """Poses and observations of some images (N,) bool, and the points that two of them observe."""
-    kept = images[model.image_ids]
-    point_of = np.repeat(np.arange(len(model.points)), np.diff(model.offsets))
-    counts = np.bincount(point_of[kept], minlength=len(model.points))
-    kept &= counts[point_of] >= 2
-    lengths = counts[counts >= 2]
-    return replace(
-        model,
-        rotations=np.where(images[:, None, None], model.rotations, np.nan),
-        translations=np.where(images[:, None], model.translations, np.nan),
-        points=model.points[counts >= 2],
-        offsets=np.r_[0, np.cumsum(lengths)].astype(np.int64),
-        image_ids=model.image_ids[kept],
-        keypoint_ids=model.keypoint_ids[kept],
-    )
-
-
 def tied_images(pairs: Array, posed: Array) -> Array:
     """Which images (N,) bool have a pose or are tied to posed ones by chains of pairs (P,2)."""
     labels = label_components(len(posed), pairs)

@@ -1,5 +1,7 @@
-"""Points and keypoints of a ``pycolmap.Reconstruction`` as arrays."""
+"""Points, observations and keypoints of a ``pycolmap.Reconstruction`` as arrays."""
 
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,14 +18,49 @@ from snakesfm.geometry.colmap_files import (
     read_image_head,
     written_files,
 )
+from snakesfm.grouping import rows_of_each
 
 Array = NDArray[Any]
 
 
-def observations_of(reconstruction: pycolmap.Reconstruction) -> tuple[Array, Array, Array, Array]:
-    """Points (T,3) by ascending id and, per observation, the rows (L,) of its point, image and keypoint."""
+@dataclass(frozen=True)
+class Tracks:
+    """Points by ascending id, and their observations in the order of the tracks.
+
+    Parameters
+    ----------
+    ids, points : (T,) int64 and (T,3) float64.
+    point_rows : (L,) int64, ascending, row of each observation's point.
+    images, rows : (L,) int64, row (not id) of each observation's image, and of its keypoint there.
+    """
+
+    ids: Array
+    points: Array
+    point_rows: Array
+    images: Array
+    rows: Array
+
+
+def read_tracks(reconstruction: pycolmap.Reconstruction) -> Tracks:
+    """The points and observations of a reconstruction.
+
+    Raises
+    ------
+    ConfigError : the installed pycolmap has binary files of another layout.
+    """
     with written_files(reconstruction) as folder:
-        content = (folder / POINTS_FILE).read_bytes()
+        return _tracks(folder / POINTS_FILE)
+
+
+def read_tracks_and_pixels(reconstruction: pycolmap.Reconstruction) -> tuple[Tracks, Array]:
+    """The same and, per observation, the pixel (L,2) float64 where its keypoint is now."""
+    with written_files(reconstruction) as folder:
+        tracks = _tracks(folder / POINTS_FILE)
+        return tracks, _pixels(folder / IMAGES_FILE, tracks)
+
+
+def _tracks(path: Path) -> Tracks:
+    content = path.read_bytes()
     (count,) = COUNT.unpack_from(content)
     heads, tracks, at = [], [], COUNT.size
     for _ in range(count):
@@ -40,27 +77,22 @@ def observations_of(reconstruction: pycolmap.Reconstruction) -> tuple[Array, Arr
     sorted_lengths = lengths[order]
     shifts = (ends - lengths)[order] - (np.cumsum(sorted_lengths) - sorted_lengths)
     elements = elements[np.repeat(shifts, sorted_lengths) + np.arange(len(elements))]
-    point_rows = np.repeat(np.arange(len(points)), sorted_lengths)
-    images, rows = elements["image"].astype(np.int64) - 1, elements["keypoint"].astype(np.int64)
-    return points["xyz"][order], point_rows, images, rows
+    return Tracks(
+        points["id"][order].astype(np.int64),
+        points["xyz"][order],
+        np.repeat(np.arange(len(points)), sorted_lengths),
+        elements["image"].astype(np.int64) - 1,
+        elements["keypoint"].astype(np.int64),
+    )
 
 
-def observed_keypoints(reconstruction: pycolmap.Reconstruction, images: Array, rows: Array) -> Array:
-    """Pixels (L,2) of keypoints, as the reconstruction holds them now.
-
-    Parameters
-    ----------
-    images : (L,) image of each keypoint (row, not id); registered.
-    rows : (L,) row of each keypoint in its image.
-    """
-    pixels = np.empty((len(images), 2))
-    order = np.argsort(images, kind="stable")
-    bounds = np.searchsorted(images[order], np.arange(int(images.max(initial=-1)) + 2))
-    with written_files(reconstruction) as folder, (folder / IMAGES_FILE).open("rb") as file:
+def _pixels(path: Path, tracks: Tracks) -> Array:
+    pixels = np.empty((len(tracks.images), 2))
+    of_image = dict(rows_of_each(tracks.images))
+    with path.open("rb") as file:
         for _ in range(COUNT.unpack(file.read(COUNT.size))[0]):
             image_id, _, count = read_image_head(file)
             keypoints = np.frombuffer(file.read(count * KEYPOINT.itemsize), KEYPOINT)["xy"]
-            if image_id < len(bounds):
-                mine = order[bounds[image_id - 1] : bounds[image_id]]
-                pixels[mine] = keypoints[rows[mine]]
+            mine = of_image.get(image_id - 1, slice(0))
+            pixels[mine] = keypoints[tracks.rows[mine]]
     return pixels

@@ -4,13 +4,12 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-import cv2  # noqa: F401 - must be loaded before pycolmap, whose PNG library clashes otherwise
 import numpy as np
-import pycolmap
 from numpy.typing import NDArray
 
-from snakesfm.bundle.reading import observations_of
+from snakesfm.bundle.reading import read_tracks
 from snakesfm.bundle.resection import resect
+from snakesfm.geometry.colmap_binding import pycolmap
 
 Array = NDArray[Any]
 
@@ -104,12 +103,11 @@ class _ObservedKeypoints:
 
     @classmethod
     def of(cls, reconstruction: pycolmap.Reconstruction) -> "_ObservedKeypoints":
-        ids = np.array(sorted(reconstruction.point3D_ids()), dtype=np.int64)
-        _, points, images, rows = observations_of(reconstruction)
-        factor = int(rows.max(initial=0)) + 1
-        keys = (images + 1) * factor + rows
+        tracks = read_tracks(reconstruction)
+        factor = int(tracks.rows.max(initial=0)) + 1
+        keys = (tracks.images + 1) * factor + tracks.rows
         order = np.argsort(keys)
-        return cls(keys[order], factor, ids[points[order]])
+        return cls(keys[order], factor, tracks.ids[tracks.point_rows[order]])
 
     def look_up(self, image_id: int, rows: Array) -> tuple[Array, Array]:
         """Which keypoints (K,) of an image observe a point, (K,) bool, and the points of those that do."""

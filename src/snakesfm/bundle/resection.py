@@ -4,12 +4,11 @@ import copy
 from dataclasses import dataclass
 from typing import Any
 
-import cv2  # noqa: F401 - must be loaded before pycolmap, whose PNG library clashes otherwise
 import numpy as np
 import poselib
-import pycolmap
 from numpy.typing import NDArray
 
+from snakesfm.geometry.colmap_binding import pycolmap
 from snakesfm.geometry.poses import to_rigid3d
 
 Array = NDArray[Any]

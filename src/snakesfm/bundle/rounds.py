@@ -4,9 +4,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence, Set
 from dataclasses import replace
 from typing import Literal
 
-import cv2  # noqa: F401 - must be loaded before pycolmap, whose PNG library clashes otherwise
 import numpy as np
-import pycolmap
 
 from snakesfm.bundle.completion import TrackCompleter
 from snakesfm.bundle.filtering import (
@@ -32,6 +30,7 @@ from snakesfm.bundle.round_settings import RoundRecord, RoundSettings
 from snakesfm.bundle.selection import adjust_selection
 from snakesfm.bundle.wild_cameras import WildCause, is_guessed, reset_wild_cameras, usual_focal_px
 from snakesfm.geometry.camera import Camera
+from snakesfm.geometry.colmap_binding import pycolmap
 
 EARLY_TOLERANCE = 300.0
 # of the longest plausible focal length: the rays of such a lens are all but parallel

@@ -1,18 +1,17 @@
 """Large models adjusted by a selection of their points; the other points follow with the cameras held."""
 
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import Any
 
-import cv2  # noqa: F401 - must be loaded before pycolmap, whose PNG library clashes otherwise
 import numpy as np
-import pycolmap
 from numpy.typing import NDArray
 
 from snakesfm.bundle.interface import BundleAdjuster, SolverSettings
 from snakesfm.bundle.model import BundleModel, to_reconstruction
-from snakesfm.bundle.reading import observations_of, observed_keypoints
+from snakesfm.bundle.reading import read_tracks, read_tracks_and_pixels
 from snakesfm.geometry.camera import Camera
+from snakesfm.geometry.colmap_binding import pycolmap
+from snakesfm.geometry.colmap_writing import keypoints_of_observations
 from snakesfm.grouping import rows_of_each
 
 Array = NDArray[Any]
@@ -70,19 +69,19 @@ def adjust_selection(
     -------
     The robust cost of the chosen points before and after, px^2.
     """
-    points, point_rows, images, rows = observations_of(reconstruction)
+    tracks, pixels = read_tracks_and_pixels(reconstruction)
+    ids, points, point_rows, images = tracks.ids, tracks.points, tracks.point_rows, tracks.images
     if not len(points):
         return 0.0, 0.0
-    pixels = observed_keypoints(reconstruction, images, rows)
     chosen = select_points(point_rows, images, len(points), per_image, seed)
     mine = chosen[point_rows]
     small = _part(reconstruction, points[chosen], point_rows[mine], images[mine], pixels[mine])
     followers, owners = np.unique(point_rows[~mine], return_inverse=True)
     images, pixels = images[~mine].astype(np.int32), pixels[~mine]
     # the solver needs the memory
-    del point_rows, rows, mine
+    del tracks, point_rows, mine
     costs = adjust(small, solving)
-    points[chosen] = observations_of(small)[0]
+    points[chosen] = read_tracks(small).points
     for camera_id, camera in small.cameras.items():
         reconstruction.camera(camera_id).params = camera.params
     for image_id in small.reg_image_ids():
@@ -90,7 +89,7 @@ def adjust_selection(
         image.frame.set_cam_from_world(image.camera_id, small.image(image_id).cam_from_world())
     views = _Views.of(reconstruction, images, pixels)
     points[followers] = follow_cameras(points[followers], owners, views, solving.loss_scale_px)
-    for point_id, xyz in zip(sorted(reconstruction.point3D_ids()), points, strict=True):
+    for point_id, xyz in zip(ids.tolist(), points, strict=True):
         reconstruction.point3D(point_id).xyz = xyz
     return costs
 
@@ -109,10 +108,7 @@ def _part(
             rotations[image_id - 1], translations[image_id - 1] = pose.rotation.matrix(), pose.translation
     camera_count = max(reconstruction.cameras)
     cameras = [Camera.of_pycolmap(reconstruction.camera(row + 1)) for row in range(camera_count)]
-    by_image = np.argsort(images, kind="stable")
-    bounds = np.searchsorted(images[by_image], np.arange(count + 1))
-    keypoint_ids = np.empty(len(images), dtype=np.int64)
-    keypoint_ids[by_image] = np.arange(len(images)) - np.repeat(bounds[:-1], np.diff(bounds))
+    keypoints, keypoint_ids = keypoints_of_observations(images, pixels, count)
     rows = np.unique(point_rows, return_inverse=True)[1]
     model = BundleModel(
         tuple(cameras),
@@ -124,7 +120,6 @@ def _part(
         images,
         keypoint_ids,
     )
-    keypoints = [pixels[by_image[start:end]] for start, end in pairwise(bounds.tolist())]
     return to_reconstruction(model, keypoints, [str(row) for row in range(count)])
 
 

@@ -3,11 +3,10 @@
 from collections.abc import Mapping, Sequence
 from typing import Literal
 
-import cv2  # noqa: F401 - must be loaded before pycolmap, whose PNG library clashes otherwise
 import numpy as np
-import pycolmap
 
 from snakesfm.geometry.camera import Camera
+from snakesfm.geometry.colmap_binding import pycolmap
 
 WildCause = Literal["focal length", "distortion"]
 

@@ -6,9 +6,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from snakesfm.export.observations import with_observations
 from snakesfm.geometry.camera import Camera
 from snakesfm.geometry.colmap_binding import pycolmap
+from snakesfm.geometry.colmap_writing import keypoints_of_observations, with_observations
 from snakesfm.geometry.poses import to_rigid3d
 
 Array = NDArray[Any]
@@ -61,7 +61,8 @@ def build_reconstruction(
     for row in registered.tolist():
         image = pycolmap.Image(name=names[row], camera_id=int(camera_ids[row]) + 1, image_id=row + 1)
         model.add_image_with_trivial_frame(image, to_rigid3d(rotations[row], translations[row]))
-    return with_observations(model, points, colors, errors_px, offsets, image_ids, keypoints)
+    per_image, keypoint_ids = keypoints_of_observations(image_ids, keypoints, len(names))
+    return with_observations(model, per_image, points, offsets, image_ids, keypoint_ids, colors, errors_px)
 
 
 def other_model_sizes(models: Array) -> list[int]:

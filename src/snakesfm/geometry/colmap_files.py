@@ -30,6 +30,8 @@ ELEMENT = np.dtype([("image", "<u4"), ("keypoint", "<u4")])
 IMAGE = struct.Struct("<I7dI")
 """An image of images.bin: id, pose, camera; its name with a zero at its end and its keypoints follow."""
 KEYPOINT = np.dtype([("xy", "<f8", 2), ("point", "<u8")])
+NO_POINT = np.iinfo(np.uint64).max
+"""The point of a KEYPOINT that observes none."""
 
 OTHER_LAYOUT = (
     "pycolmap {version} writes another {file} than snakesfm knows: run 'pip install -c constraints.txt .' "

@@ -4,9 +4,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import cv2  # noqa: F401 - must be loaded before pycolmap, whose PNG library clashes otherwise
 import numpy as np
-import pycolmap
 
 from snakesfm.artifacts.gather import gather_image_columns, gather_inlier_matches, gather_refused_pairs
 from snakesfm.artifacts.images import CalibratedCameras, ImageIndex
@@ -22,15 +20,16 @@ from snakesfm.bundle.model import (
     from_reconstruction,
     mean_point_errors,
     reprojection_errors,
+    restrict_to,
     to_reconstruction,
 )
-from snakesfm.bundle.models import join_models, restrict_to, tied_images
-from snakesfm.bundle.reading import observed_keypoints
+from snakesfm.bundle.models import join_models, tied_images
 from snakesfm.bundle.round_settings import RoundRecord, RoundSettings
 from snakesfm.bundle.rounds import adjust_rounds
 from snakesfm.bundle.wild_cameras import WildCause
 from snakesfm.errors import SceneError
 from snakesfm.geometry.camera import cameras_from_columns, cameras_to_columns
+from snakesfm.geometry.colmap_binding import pycolmap
 from snakesfm.geometry.detector_pixels import (
     detector_scales,
     reduce_all_keypoints,
@@ -176,8 +175,7 @@ def _adjust(
         _print_record(reported[-1])
 
     adjust_rounds(reconstruction, read_graph, poses.cameras, solving, settings, report, sources)
-    result = from_reconstruction(reconstruction, poses)
-    observed = observed_keypoints(reconstruction, result.image_ids, result.keypoint_ids)
+    result, observed = from_reconstruction(reconstruction, poses)
     return result, observed.astype(np.float32), reported
 
 
@@ -203,7 +201,7 @@ def _start(
         image_ids=start.image_ids,
         keypoint_ids=start.keypoint_ids,
     )
-    return to_reconstruction(restrict_to(model, poses.registered), reduced, index.names.tolist(), images)
+    return to_reconstruction(model, reduced, index.names.tolist(), images)
 
 
 def _usable_pairs(graph: ViewGraph, poses: BundleModel) -> np.ndarray:

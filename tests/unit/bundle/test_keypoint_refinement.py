@@ -12,7 +12,7 @@ from snakesfm.bundle.alignment import (
 )
 from snakesfm.bundle.keypoint_refinement import most_share_a_camera, refine_keypoints
 from snakesfm.bundle.model import BundleModel, to_reconstruction
-from snakesfm.bundle.reading import observations_of, observed_keypoints
+from snakesfm.bundle.reading import read_tracks, read_tracks_and_pixels
 from snakesfm.geometry.camera import Camera
 from snakesfm.geometry.rotations import exp_so3
 
@@ -85,9 +85,10 @@ def model_of(scene, noise_px: float):
 
 def spread_px(reconstruction, pixels: np.ndarray) -> np.ndarray:
     """How far (L,) the keypoints of a point are from their true places, up to what all of them share."""
-    points, point_of, images, rows = observations_of(reconstruction)
-    offsets = observed_keypoints(reconstruction, images, rows) - pixels[images, rows]
-    sums = np.zeros((len(points), 2))
+    tracks, places = read_tracks_and_pixels(reconstruction)
+    offsets = places - pixels[tracks.images, tracks.rows]
+    point_of = tracks.point_rows
+    sums = np.zeros((len(tracks.points), 2))
     np.add.at(sums, point_of, offsets)
     return np.linalg.norm(offsets - (sums / np.bincount(point_of)[:, None])[point_of], axis=1)
 
@@ -117,12 +118,14 @@ def test_keypoints_of_a_point_come_to_agree(scene, scale, least, most):
 
 def disagreement_px(reconstruction, poses) -> float:
     """How far the keypoints of a point are from each other on the plane, median in its texture's pixels."""
-    points, point_of, images, rows = observations_of(reconstruction)
-    pixels = observed_keypoints(reconstruction, images, rows)
+    tracks, pixels = read_tracks_and_pixels(reconstruction)
+    point_of = tracks.point_rows
     to_plane = np.array([np.linalg.inv(plane_to_image(*pose)) for pose in poses])
-    places = np.einsum("lij,lj->li", to_plane[images], np.column_stack([pixels, np.ones(len(pixels))]))
+    places = np.einsum(
+        "lij,lj->li", to_plane[tracks.images], np.column_stack([pixels, np.ones(len(pixels))])
+    )
     places = TEXTURE_PX_PER_UNIT * places[:, :2] / places[:, 2:]
-    sums = np.zeros((len(points), 2))
+    sums = np.zeros((len(tracks.points), 2))
     np.add.at(sums, point_of, places)
     means = sums / np.bincount(point_of)[:, None]
     return float(np.median(np.linalg.norm(places - means[point_of], axis=1)))
@@ -149,7 +152,8 @@ def test_an_observation_of_something_else_is_dropped_and_an_image_of_another_loo
     images[4] = other
     reconstruction = model_of(scene, 0.2)
     refine_keypoints(reconstruction, read(images), np.ones(5), SETTINGS)
-    _, _, owners, rows = observations_of(reconstruction)
+    tracks = read_tracks(reconstruction)
+    owners, rows = tracks.images, tracks.rows
     hidden = scene[3][1][:, 0] < 90
     kept = np.isin(np.arange(150), rows[owners == 1])
     assert hidden.sum() > 5

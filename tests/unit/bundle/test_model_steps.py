@@ -13,7 +13,7 @@ from snakesfm.bundle.filtering import deregister_weak_images, drop_short_tracks,
 from snakesfm.bundle.interface import SolverSettings
 from snakesfm.bundle.model import BundleModel, from_reconstruction, reprojection_errors, to_reconstruction
 from snakesfm.bundle.registration import register_left_out
-from snakesfm.geometry.poses import translation_of
+from snakesfm.geometry.poses import to_rigid3d, translation_of
 from snakesfm.geometry.rotations import angle_of
 from snakesfm.synthetic.problems import make_problem, perturb_rotations
 
@@ -55,7 +55,9 @@ def errors_px(model, made):
 def test_round_trip_keeps_everything_and_sorts():
     made = problem()
     model = model_of(made, left_out=[3])
-    result = from_reconstruction(to_reconstruction(model, made.keypoints, NAMES), model)
+    result, pixels = from_reconstruction(to_reconstruction(model, made.keypoints, NAMES), model)
+    expected = [made.keypoints[i][k] for i, k in zip(result.image_ids, result.keypoint_ids, strict=True)]
+    np.testing.assert_array_equal(pixels, expected)
     assert np.isnan(result.rotations[3]).all() and not (result.image_ids == 3).any()
     posed = np.arange(12) != 3
     np.testing.assert_allclose(result.rotations[posed], model.rotations[posed], atol=1e-12)
@@ -68,15 +70,45 @@ def test_round_trip_keeps_everything_and_sorts():
     for a, b in zip(result.offsets[:-1], result.offsets[1:], strict=True):
         assert b - a >= 2 and np.all(np.diff(result.image_ids[a:b]) > 0)
     assert 0.2 < errors_px(result, made).mean() < 0.6
-    again = from_reconstruction(to_reconstruction(result, made.keypoints, NAMES), result)
+    again, _ = from_reconstruction(to_reconstruction(result, made.keypoints, NAMES), result)
     np.testing.assert_array_equal(again.points, result.points)
     np.testing.assert_array_equal(again.keypoint_ids, result.keypoint_ids)
+
+
+def test_pycolmaps_model_is_that_of_single_objects():
+    made = problem()
+    model = model_of(made, left_out=[3, 7])
+    taking_part = np.arange(12) != 7
+    found = to_reconstruction(model, made.keypoints, NAMES, taking_part)
+    expected = pycolmap.Reconstruction()
+    expected.add_camera_with_trivial_rig(made.cameras[0].to_pycolmap(1))
+    for row in np.flatnonzero(taking_part).tolist():
+        image = pycolmap.Image(
+            name=NAMES[row], camera_id=1, image_id=row + 1, keypoints=made.keypoints[row].astype(float)
+        )
+        pose = [to_rigid3d(model.rotations[row], model.translations[row])] if row != 3 else []
+        expected.add_image_with_trivial_frame(image, *pose)
+    for point, start, end in zip(model.points, model.offsets[:-1], model.offsets[1:], strict=True):
+        seen = [k for k in range(start, end) if model.image_ids[k] not in (3, 7)]
+        track = [pycolmap.TrackElement(model.image_ids[k] + 1, model.keypoint_ids[k]) for k in seen]
+        if len(track) >= 2:
+            expected.add_point3D(point, pycolmap.Track(track))
+    assert len(model.points) > found.num_points3D() > 100
+    # the order in which pycolmap goes through points decides what is merged first
+    assert list(found.points3D) == list(expected.points3D)
+    assert found.reg_image_ids() == expected.reg_image_ids() == [1, 2, 3, 5, 6, 7, 9, 10, 11, 12]
+    for name in ("points3D", "images", "frames", "cameras"):
+        there, wanted = getattr(found, name), getattr(expected, name)
+        assert sorted(there) == sorted(wanted)
+        assert {key: repr(value.todict()) for key, value in there.items()} == {
+            key: repr(value.todict()) for key, value in wanted.items()
+        }
 
 
 def test_empty_model():
     made = problem()
     model = model_of(made, left_out=range(12))
-    result = from_reconstruction(to_reconstruction(model, made.keypoints, NAMES), model)
+    result, _ = from_reconstruction(to_reconstruction(model, made.keypoints, NAMES), model)
     assert result.points.shape == (0, 3) and result.offsets.tolist() == [0]
     assert errors_px(result, made).shape == (0,)
 
@@ -92,13 +124,13 @@ def test_filter_drops_observations_and_not_whole_tracks():
     model = model_of(made)
     reconstruction = to_reconstruction(model, made.keypoints, NAMES)
     dropped = filter_observations(reconstruction, 4.0, 0.0)
-    result = from_reconstruction(reconstruction, model)
+    result, _ = from_reconstruction(reconstruction, model)
     assert errors_px(result, made).max() <= 4.0
     assert made.track_outliers.sum() * 0.9 < dropped < made.track_outliers.sum() * 1.6
     filter_observations(reconstruction, 4.0, 0.0, 3)
-    assert np.diff(from_reconstruction(reconstruction, model).offsets).min() == 3
+    assert np.diff(from_reconstruction(reconstruction, model)[0].offsets).min() == 3
     drop_short_tracks(reconstruction, 4)
-    assert np.diff(from_reconstruction(reconstruction, model).offsets).min() == 4
+    assert np.diff(from_reconstruction(reconstruction, model)[0].offsets).min() == 4
 
 
 def test_images_of_few_long_tracks_keep_their_short_ones():
@@ -139,7 +171,7 @@ def test_completion_brings_observations_back(min_angle_deg):
     drop_short_tracks(reconstruction, 2)
     before = reconstruction.compute_num_observations()
     added = TrackCompleter(reconstruction, graph_of(made), 4.0, min_angle_deg, 0)()
-    result = from_reconstruction(reconstruction, model)
+    result, _ = from_reconstruction(reconstruction, model)
     assert added == len(result.image_ids) - before > 0.3 * len(half)
     assert errors_px(result, made).max() < 6.0
 

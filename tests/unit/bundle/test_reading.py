@@ -5,7 +5,7 @@ import numpy as np
 import pycolmap
 
 from snakesfm.bundle.model import BundleModel, to_reconstruction
-from snakesfm.bundle.reading import observations_of, observed_keypoints
+from snakesfm.bundle.reading import read_tracks, read_tracks_and_pixels
 from snakesfm.synthetic.problems import make_problem
 
 
@@ -37,34 +37,38 @@ def reconstruction_with_gaps():
     return reconstruction
 
 
-def test_observations_are_those_of_the_tracks_in_their_order():
+def test_points_and_observations_are_those_of_the_tracks_in_their_order():
     reconstruction = reconstruction_with_gaps()
-    points, owners, images, rows = observations_of(reconstruction)
+    tracks = read_tracks(reconstruction)
     ids = sorted(reconstruction.point3D_ids())
-    np.testing.assert_array_equal(points, [reconstruction.point3D(k).xyz for k in ids])
+    assert tracks.ids.tolist() == ids
+    np.testing.assert_array_equal(tracks.points, [reconstruction.point3D(k).xyz for k in ids])
     expected = [
         (row, element.image_id - 1, element.point2D_idx)
         for row, k in enumerate(ids)
         for element in reconstruction.point3D(k).track.elements
     ]
-    np.testing.assert_array_equal(np.stack([owners, images, rows], axis=1), expected)
-
-
-def test_keypoints_are_those_of_the_images():
-    reconstruction = reconstruction_with_gaps()
-    _, _, images, rows = observations_of(reconstruction)
-    reconstruction.image(int(images[5]) + 1).point2D(int(rows[5])).xy = (1.25, 7.5)
-    expected = [
-        reconstruction.image(i + 1).point2D(k).xy
-        for i, k in zip(images.tolist(), rows.tolist(), strict=True)
-    ]
-    np.testing.assert_array_equal(observed_keypoints(reconstruction, images, rows), expected)
     np.testing.assert_array_equal(
-        observed_keypoints(reconstruction, images[::-1], rows[::-1]), expected[::-1]
+        np.stack([tracks.point_rows, tracks.images, tracks.rows], axis=1), expected
     )
 
 
+def test_pixels_are_those_of_the_images_keypoints_now():
+    reconstruction = reconstruction_with_gaps()
+    before = read_tracks(reconstruction)
+    reconstruction.image(int(before.images[5]) + 1).point2D(int(before.rows[5])).xy = (1.25, 7.5)
+    tracks, pixels = read_tracks_and_pixels(reconstruction)
+    for name, values in vars(before).items():
+        np.testing.assert_array_equal(getattr(tracks, name), values)
+    expected = [
+        reconstruction.image(i + 1).point2D(k).xy
+        for i, k in zip(tracks.images.tolist(), tracks.rows.tolist(), strict=True)
+    ]
+    np.testing.assert_array_equal(pixels, expected)
+    assert pixels[5].tolist() == [1.25, 7.5]
+
+
 def test_an_empty_model_has_none():
-    points, owners, images, rows = observations_of(pycolmap.Reconstruction())
-    assert len(points) == len(owners) == len(images) == len(rows) == 0
-    assert observed_keypoints(pycolmap.Reconstruction(), images, rows).shape == (0, 2)
+    tracks, pixels = read_tracks_and_pixels(pycolmap.Reconstruction())
+    assert {len(values) for values in vars(tracks).values()} == {0}
+    assert tracks.points.shape == (0, 3) and pixels.shape == (0, 2)

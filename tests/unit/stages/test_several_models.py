@@ -11,7 +11,8 @@ from synthetic_scene import HEADER, side_by_side, true_model, write_scene
 from snakesfm.artifacts import CameraCenters, CameraRotations, Reconstruction
 from snakesfm.artifacts.gather import gather_image_columns, gather_inlier_matches
 from snakesfm.bundle import rounds
-from snakesfm.bundle.models import join_models, restrict_to, tied_images
+from snakesfm.bundle.model import restrict_to
+from snakesfm.bundle.models import join_models, tied_images
 from snakesfm.config.adjust_bundle import AdjustBundleOptions
 from snakesfm.config.average_rotations import AverageRotationsOptions
 from snakesfm.config.average_translations import AverageTranslationsOptions
