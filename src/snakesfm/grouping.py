@@ -17,6 +17,29 @@ def rows_of_each(values: Array) -> list[tuple[int, Array]]:
     return list(zip(found.tolist(), np.split(order, starts[1:]), strict=True))
 
 
+def components_of(count: int, links: Array) -> Array:
+    """Connected component of each of ``count`` nodes, (count,) int64, in the order of their first nodes.
+
+    Parameters
+    ----------
+    links : (M,2) int, nodes in 0 .. count-1.
+    """
+    nodes = np.arange(count)
+    roots = nodes
+    heads, tails = np.asarray(links, dtype=np.int64).reshape(-1, 2).T
+    # numpy rather than scipy.sparse.csgraph, whose import takes longer than most whole jobs
+    while True:
+        lower = np.minimum(roots[heads], roots[tails])
+        joined = roots.copy()
+        np.minimum.at(joined, roots[heads], lower)
+        np.minimum.at(joined, roots[tails], lower)
+        while not np.array_equal(joined, further := joined[joined]):
+            joined = further
+        if np.array_equal(joined, roots):
+            return np.asarray((np.cumsum(roots == nodes) - 1)[roots])
+        roots = joined
+
+
 def one_to_one(pairs: Array) -> Array:
     """Rows (K,) int64 ascending of pairs (M,2), taken in their order where both numbers are still free."""
     taken, left = [np.zeros(0, np.int64)], np.arange(len(pairs))
