@@ -1,5 +1,6 @@
 """Rows of arrays that belong together."""
 
+import math
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,20 @@ def rows_of_each(values: Array) -> list[tuple[int, Array]]:
     order = np.argsort(values, kind="stable")
     found, starts = np.unique(values[order], return_index=True)
     return list(zip(found.tolist(), np.split(order, starts[1:]), strict=True))
+
+
+def sum_by(values: Array, groups: Array, count: int) -> Array:
+    """Sums (count, ...) of values (Q, ...) over the groups (Q) that they belong to, in their order.
+
+    By a sparse product, which reads many numbers per row in one pass: a pass for each takes several times
+    as long where they no longer fit the processor's caches.
+    """
+    from scipy.sparse import csc_array
+
+    flat = values.reshape(len(values), math.prod(values.shape[1:]))
+    ones, places = np.ones(len(groups)), np.arange(len(groups) + 1)
+    sums = csc_array((ones, groups, places), shape=(count, len(groups))) @ flat
+    return np.asarray(sums.reshape(count, *values.shape[1:]))
 
 
 def components_of(count: int, links: Array) -> Array:

@@ -12,9 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from snakesfm.geometry.sparse_systems import solve_spd
-from snakesfm.grouping import components_of
+from snakesfm.grouping import components_of, sum_by
 from snakesfm.translation_averaging.clusters import join_clusters
-from snakesfm.translation_averaging.landmarks import sum_by
 from snakesfm.translation_averaging.problem import PositioningProblem
 
 Array = NDArray[Any]
