@@ -99,7 +99,7 @@ def average_view_graph(
         )
 
     kept = reasons == "kept"
-    components = keep_largest_component(graph.node_count, graph.pairs, reasons)[1]
+    components = label_components(graph.node_count, graph.pairs[kept])
     rotations = average(kept)
     judging = rotations if kept.all() else _improve_on_all(graph, rotations)
     for remaining in range(passes - 1, -1, -1):
