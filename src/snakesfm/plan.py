@@ -1,4 +1,4 @@
-"""What the Snakefile asks of the configuration: which scenes there are, and which weights they need."""
+"""The plan of a run for the Snakefile: its scenes, and the weights they need."""
 
 import os
 from collections.abc import Mapping

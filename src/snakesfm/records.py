@@ -1,4 +1,4 @@
-"""What Snakemake noted of the files that it made."""
+"""Snakemake's records of the files that it made."""
 
 import json
 import os

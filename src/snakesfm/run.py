@@ -1,4 +1,4 @@
-"""The start and the end of a run, as a person sees them."""
+"""The start and the end of a run, with the messages to the user."""
 
 import contextlib
 import fcntl

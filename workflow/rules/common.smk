@@ -19,7 +19,7 @@ from snakesfm.run import Run
 
 
 def refusal(error):
-    """The error as one of Snakemake's, which '--quiet all' hides, so that the sentence is said here then."""
+    """The error as one of Snakemake's; '--quiet all' would hide it, so it is printed here in that case."""
     if Quietness.ALL in (workflow.output_settings.quiet or ()):
         sys.stderr.write(f"snakesfm: {error}\n")
     return WorkflowError(str(error))
@@ -131,7 +131,7 @@ def global_descriptors(wildcards):
 
 
 def previewed_features(wildcards):
-    """The features of all blocks where pairs are looked at before they are chosen, else nothing."""
+    """The features of all blocks if pairs are previewed before they are chosen, else nothing."""
     return PLAN.scenes[wildcards.scene].previewed_features()
 
 

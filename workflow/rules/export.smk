@@ -1,4 +1,4 @@
-# The model, and what it was made from, in the formats that others read, and how good it is.
+# The model and its inputs in the formats of other tools, and its evaluation.
 
 
 rule export_database:

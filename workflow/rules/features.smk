@@ -72,7 +72,7 @@ for blocks, scenes in PLAN.scenes_by_blocks().items():
             log_file("select_pairs"),
         wildcard_constraints:
             scene=any_of(scenes),
-        # blocks of the similarity matrix are computed side by side, and pairs looked at
+        # blocks of the similarity matrix are computed in parallel, and so are previews of pairs
         threads: 2
         resources:
             mem_mb=memory_mb("select_pairs"),

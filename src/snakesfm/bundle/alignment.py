@@ -1,4 +1,4 @@
-"""Keypoints of a point aligned to each other by the images' gray values.
+"""Alignment of a point's keypoints to each other by the images' gray values.
 
 A detector places each keypoint on its own; the pixels around the keypoints of one point show one piece of
 surface, and agree on its place several times better (Lindenberger et al., Pixel-Perfect

@@ -1,4 +1,4 @@
-"""More observations for the model: tracks completed and merged, points made of left-out matches."""
+"""Completion of the model: tracks are completed and merged, points triangulated from unused matches."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any

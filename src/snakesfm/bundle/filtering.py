@@ -1,4 +1,4 @@
-"""What is taken out of the model between rounds: observations, points and images."""
+"""Removal of observations, points and images from the model between rounds."""
 
 import heapq
 from collections import Counter

@@ -1,4 +1,4 @@
-"""What a solver of bundle adjustment is given and gives back."""
+"""The interface of bundle adjustment solvers."""
 
 from dataclasses import dataclass
 from typing import Any, Literal, Protocol

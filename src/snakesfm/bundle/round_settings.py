@@ -1,4 +1,4 @@
-"""What the rounds of bundle adjustment are told, and what they say of themselves."""
+"""Settings of the rounds of bundle adjustment, and records of their results."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""The whole configuration: what config.yaml and ``--config`` may hold."""
+"""The whole configuration: what config.yaml and ``--config`` may contain."""
 
 import datetime
 import difflib

@@ -1,4 +1,4 @@
-"""The metrics of a model: against reference poses, and those that need no truth."""
+"""The metrics of a model: against reference poses, and those that need no reference."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field

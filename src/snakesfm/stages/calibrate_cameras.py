@@ -1,4 +1,4 @@
-"""Stage calibrate_cameras: focal lengths that nobody gave, from the matches."""
+"""Stage calibrate_cameras: unknown focal lengths from the matches."""
 
 from collections.abc import Iterable
 from itertools import groupby

@@ -1,4 +1,4 @@
-"""What a stage gets to work with, wherever it runs."""
+"""The inputs, outputs and options of a stage, wherever it runs."""
 
 import json
 import os

@@ -1,4 +1,4 @@
-"""How much longer tracks get by merging what a detector-free matcher finds pair by pair."""
+"""Track lengths before and after merging the keypoints of a detector-free matcher."""
 
 from collections.abc import Callable
 from typing import Any

@@ -1,4 +1,4 @@
-"""Splitting of components at links that nothing confirms, and where they see an image twice."""
+"""Splitting of components at unconfirmed links, and where they contain two points of one image."""
 
 from typing import Any
 

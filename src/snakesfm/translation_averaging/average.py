@@ -41,7 +41,7 @@ def average_components(
     edge_weight: float = 0.1,
     seed: int = 0,
 ) -> AveragedCenters:
-    """Position the cameras of each component (N,) of the images, -1 for none, in a world of its own."""
+    """Position the cameras of each component (N,) of the images, -1 for none, in its own frame."""
     centers = np.full((problem.image_count, 3), np.nan)
     edge_residuals = np.full(len(problem.pairs), np.nan)
     rays = []

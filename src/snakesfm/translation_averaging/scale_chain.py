@@ -1,4 +1,4 @@
-"""First guess of the centres: baselines of the edges from shared landmarks, then linear least squares.
+"""Initial centres: baseline ratios of edges from shared landmarks, then linear least squares.
 
 After Cui and Tan, "Global Structure-from-Motion by Similarity Averaging" (ICCV 2015): the two cameras of an
 edge see a landmark at a depth that is known up to the edge's baseline; two edges that share a camera and a

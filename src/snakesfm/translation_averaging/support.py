@@ -1,4 +1,4 @@
-"""Which centres the measurements hold in place, and how well."""
+"""Test of which camera centres the measurements determine, and how well."""
 
 import math
 from dataclasses import dataclass

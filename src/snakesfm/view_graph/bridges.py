@@ -1,4 +1,4 @@
-"""Bridges of a view graph: edges on which alone the connection of two parts hangs."""
+"""Bridges of a view graph: edges that are the only connection between two parts."""
 
 from typing import Any
 
