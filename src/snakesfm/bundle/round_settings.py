@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
-from snakesfm.bundle.interface import Loss
+from snakesfm.bundle.interface import Loss, Solver
 from snakesfm.bundle.wild_cameras import WildCause
 
 
@@ -12,7 +12,7 @@ from snakesfm.bundle.wild_cameras import WildCause
 class RoundSettings:
     """What is done in and between the rounds; see the options of adjust_bundle for each."""
 
-    solver: Literal["ceres", "gtsam"] = "ceres"
+    solver: Solver = "ceres"
     thresholds_px: tuple[float, ...] = (10.0, 5.0, 3.0)
     rotations_first: bool = False
     loss_scale_px: float | Literal["auto"] = "auto"

@@ -4,8 +4,6 @@ from collections.abc import Callable, Collection, Mapping, Sequence, Set
 from dataclasses import replace
 from typing import Literal
 
-import numpy as np
-
 from snakesfm.bundle.completion import TrackCompleter
 from snakesfm.bundle.filtering import (
     deregister_images_alone,
@@ -21,7 +19,8 @@ from snakesfm.bundle.focal_pairs import (
     with_two_focals,
 )
 from snakesfm.bundle.image_sources import ImageSource
-from snakesfm.bundle.interface import BundleAdjuster, SolverSettings
+from snakesfm.bundle.interface import SolverSettings, bundle_adjuster
+from snakesfm.bundle.keypoint_noise import keypoint_noise_px
 from snakesfm.bundle.keypoint_refinement import refine_keypoints
 from snakesfm.bundle.lenses import find_wider_lenses, set_camera
 from snakesfm.bundle.principal_points import find_told_cameras
@@ -43,17 +42,6 @@ CHEAP_STEPS = 2_000_000
 MOST_STEPS = 500
 # of exact keypoints the model shows no noise but that of float32 and of the solver
 EXACT_PX = 0.05
-
-
-def bundle_adjuster(solver: Literal["ceres", "gtsam"]) -> BundleAdjuster:
-    """The solver of a name."""
-    if solver == "gtsam":
-        from snakesfm.bundle.gtsam_solver import adjust_gtsam
-
-        return adjust_gtsam
-    from snakesfm.bundle.ceres import adjust_ceres
-
-    return adjust_ceres
 
 
 def adjust_rounds(
@@ -386,18 +374,3 @@ class _Mapper:
             for row, camera in enumerate(self.cameras)
             if is_guessed(camera) and row + 1 not in self.solving.constant_cameras
         }
-
-
-def keypoint_noise_px(reconstruction: pycolmap.Reconstruction) -> float:
-    """Standard deviation per axis of the keypoints, from the reprojection errors of the model.
-
-    The median over the points withstands wrong observations. The mean length of an error is sqrt(pi/2)
-    standard deviations, and each point takes three of the two degrees of freedom per observation.
-    """
-    reconstruction.update_point_3d_errors()
-    points = reconstruction.points3D.values()
-    errors = np.array([point.error for point in points])
-    lengths = np.array([point.track.length() for point in points])
-    if not len(errors):
-        return 1.0
-    return float(np.median(errors / np.sqrt(np.pi / 2 * (1 - 1.5 / lengths))))
