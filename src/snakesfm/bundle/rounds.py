@@ -4,7 +4,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence, Set
 from dataclasses import replace
 from typing import Literal
 
-from snakesfm.bundle.completion import TrackCompleter
+from snakesfm.bundle.completion import complete_tracks
 from snakesfm.bundle.filtering import (
     deregister_images_alone,
     deregister_weak_images,
@@ -52,7 +52,7 @@ def adjust_rounds(
     settings: RoundSettings,
     report: Callable[[RoundRecord], None],
     sources: Sequence[ImageSource] = (),
-) -> list[RoundRecord]:
+) -> None:
     """Adjust, filter and complete a model in rounds that each start from the result of the one before.
 
     Parameters
@@ -90,7 +90,6 @@ def adjust_rounds(
     mapper.tie_focal_lengths()
     if settings.register_images:
         mapper.add_left_out()
-    return mapper.records
 
 
 class _Mapper:
@@ -304,13 +303,14 @@ class _Mapper:
     def complete(self, images: Sequence[int] | None = None) -> None:
         """Complete and merge all tracks, and triangulate what ``images`` (all if None) left out."""
         settings = self.settings
-        TrackCompleter(
+        complete_tracks(
             self.reconstruction,
             self.graph,
             settings.complete_error_px,
             settings.min_angle_deg,
             settings.seed,
-        )(images)
+            images,
+        )
 
     def register(self) -> bool:
         """Register what can be; whether something was.
