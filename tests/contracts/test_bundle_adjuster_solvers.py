@@ -3,9 +3,8 @@
 import numpy as np
 import pytest
 
-from snakesfm.bundle.interface import SolverSettings
+from snakesfm.bundle.interface import SolverSettings, bundle_adjuster
 from snakesfm.bundle.model import BundleModel, from_reconstruction, reprojection_errors, to_reconstruction
-from snakesfm.bundle.rounds import bundle_adjuster
 from snakesfm.errors import ConfigError
 from snakesfm.geometry.camera import Camera
 from snakesfm.geometry.poses import translation_of

@@ -63,7 +63,6 @@ class StageJob:
     seed : the run's seed.
     threads : how many threads may be used; results never depend on it.
     former : an earlier version of the output whose unchanged parts may be taken over, or None.
-    upstream : per stage whose artifacts are read the digest of its version and options.
     batch_size : how many images or pairs a network gets at once; results never depend on it.
     """
 
@@ -76,7 +75,6 @@ class StageJob:
     seed: int = 0
     threads: int = 1
     former: Path | None = None
-    upstream: Mapping[str, str] = field(default_factory=dict)
     batch_size: int | Literal["auto"] = "auto"
 
     @property
