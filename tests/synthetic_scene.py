@@ -48,7 +48,14 @@ def write_scene(made, folder):
         warnings=[],
     ).write(folder / "index.h5", HEADER)
     CalibratedCameras(
-        models, sizes, params, sources, np.full(len(models), np.nan), np.zeros(len(models), int)
+        models,
+        sizes,
+        params,
+        sources,
+        np.full(len(models), np.nan),
+        np.zeros(len(models), int),
+        np.zeros((0, 4), int),
+        [],
     ).write(folder / "cameras.h5", HEADER)
     ViewGraph(
         pairs=made.pairs,

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from snakesfm.artifacts import ImageIndex, Reconstruction
+from snakesfm.artifacts import CalibratedCameras, ImageIndex, Reconstruction
 from snakesfm.export.colmap import (
     build_reconstruction,
     other_model_sizes,
@@ -110,6 +110,7 @@ def run(job: StageJob) -> None:
     if len(index.refused_names):
         warnings.append(REFUSED.format(count=len(index.refused_names), first=index.refused_reasons[0]))
     warnings += [str(line) for line in index.warnings]
+    warnings += [str(line) for line in CalibratedCameras.read(job.path("cameras")).warnings]
     if job.options.georeference is True and place is None:
         warnings.append(NO_PLACE)
     if place is not None and not place.trusted:

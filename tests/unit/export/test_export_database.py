@@ -64,9 +64,9 @@ def write_inputs(folder: Path, problem: SyntheticProblem) -> dict[str, str | lis
         refused_reasons=[],
         warnings=[],
     ).write(folder / "index.h5", HEADER)
-    CalibratedCameras(models, sizes, params, sources, np.zeros(2), np.zeros(2, np.int32)).write(
-        folder / "cameras.h5", HEADER
-    )
+    CalibratedCameras(
+        models, sizes, params, sources, np.zeros(2), np.zeros(2, np.int32), np.zeros((0, 4), int), []
+    ).write(folder / "cameras.h5", HEADER)
     for block in (0, 1):
         images = np.arange(block, COUNT, 2)
         counts = [len(problem.keypoints[image]) for image in images]
