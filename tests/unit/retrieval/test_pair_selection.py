@@ -128,7 +128,7 @@ def test_images_choose_partners_of_negative_similarity():
 
 def test_opposite_descriptors_are_no_less_than_the_least_similarity():
     # a vocabulary learned on two images puts their residuals on opposite sides
-    vector = np.full(4, 0.5) + [0.0004, 0.0004, 0, 0]
+    vector = np.array([0.5004, 0.5004, 0.5, 0.5])
     vectors = round_units(np.vstack([vector, -vector]))
     assert (vectors @ vectors.T)[0, 1] < -1
     assert similar_pairs([np.arange(2)], lambda block: vectors, 1, -1.0).pairs.tolist() == [[0, 1]]
