@@ -165,8 +165,8 @@ def similar_pairs(
 def similarities_of(own: Array, other: Array) -> Array:
     """Dot products (n,m) float32 of descriptors (n,D) and (m,D); -inf for images without features.
 
-    The descriptors of these are zeros. Two images that have features may well have a negative similarity:
-    half of all pairs do where the vocabulary was learned on the scene itself.
+    The descriptors of these are zeros. Images that have features may well have a negative similarity: most
+    pairs of a small scene do, as the vocabulary is learned on the scene itself.
     """
     similarities: Array = own @ other.T
     similarities[~own.any(axis=1)] = -np.inf
