@@ -158,6 +158,14 @@ class StageJob:
                 taken.update(read(path, wanted))
         return taken
 
+    def warn(self, sentence: str) -> None:
+        """Say a warning in the log and on the terminal, where a stage's result has no place for it."""
+        sys.stderr.write(f"warning: {sentence}\n")
+        if Progress.terminal is not None:
+            print(
+                f"snakesfm: scene '{self.scene}': warning: {sentence}", file=Progress.terminal, flush=True
+            )
+
     def progress(self, total: int, what: str) -> "Progress":
         """A counter that prints how far the job is, at most every five seconds."""
         return Progress(f"{self.scene}: {self.stage} {self.output.stem}", total, what)
