@@ -68,6 +68,12 @@ RESET_CAMERA = (
     "was reset and kept fixed; try an index_images.camera_model with fewer parameters, or other intrinsics."
 )
 
+FAR_PRINCIPAL_POINT = (
+    "camera {camera} ({model}): its principal point seems to lie {offset:.1%} of the longer side away from "
+    "where it is assumed, but reprojection errors hardly fall there, so it was left; if the images were "
+    "cropped, give cameras=, or raise adjust_bundle.max_principal_point_offset."
+)
+
 CUT_PICTURE = (
     "camera {camera} ({model}): undistorted/ shows only {share:.0%} of its images, because no flat image "
     "holds a view of about 180 degrees: use images/ and sparse/0 with software for fisheye lenses."
@@ -110,6 +116,13 @@ def run(job: StageJob) -> None:
         RESET_CAMERA.format(camera=row + 1, model=cameras[row].model, cause=adjusted.camera_resets[row])
         for row in used
         if adjusted.camera_resets[row]
+    ]
+    warnings += [
+        FAR_PRINCIPAL_POINT.format(
+            camera=row + 1, model=cameras[row].model, offset=adjusted.camera_offsets[row]
+        )
+        for row in used
+        if np.isfinite(adjusted.camera_offsets[row])
     ]
     warnings += _lens_warnings(model, cameras, index.camera_ids)
     if job.options.undistort:

@@ -93,6 +93,7 @@ def write_reconstruction(
     problem: SyntheticProblem,
     lost: Iterable[int] = (LOST,),
     reset: str = "",
+    offset: float = np.nan,
 ) -> Path:
     """The truth as a finished model, ``lost`` images not registered; what is wrong with the second camera."""
     rotations, translations = problem.rotations.copy(), problem.translations.copy()
@@ -107,6 +108,7 @@ def write_reconstruction(
         camera_sizes=sizes,
         camera_params=params,
         camera_resets=["", reset],
+        camera_offsets=np.array([np.nan, offset]),
         rotations=rotations,
         translations=translations,
         models=np.where(np.isin(np.arange(COUNT), list(lost)), -1, 0),
@@ -140,11 +142,12 @@ def export(
     gps: np.ndarray | None = None,
     masks: Path | None = None,
     reset: str = "",
+    offset: float = np.nan,
     **options: bool,
 ) -> Path:
     inputs = {
         "index": str(write_index(tmp_path, orientations, gps)),
-        "reconstruction": str(write_reconstruction(tmp_path, problem, lost, reset)),
+        "reconstruction": str(write_reconstruction(tmp_path, problem, lost, reset, offset)),
     }
     folder = tmp_path / "out" / "scene" / "export_model"
     images = tmp_path / "photos"
@@ -357,6 +360,18 @@ def test_a_camera_that_was_reset_and_held_is_warned_of(tmp_path, problem, reset:
     found = [line for line in summary["warnings"] if "reset and kept fixed" in line]
     assert len(found) == told
     assert all(line.startswith("camera 2 (SIMPLE_RADIAL): its distortion was") for line in found)
+
+
+@pytest.mark.parametrize(("offset", "told"), [(np.nan, 0), (0.0614, 1)])
+def test_a_far_principal_point_that_was_left_is_warned_of(
+    tmp_path, problem, offset: float, told: int
+) -> None:
+    folder = export(tmp_path, problem, offset=offset)
+    summary = json.loads((folder / "summary.json").read_text("utf-8"))
+    found = [line for line in summary["warnings"] if "max_principal_point_offset" in line]
+    assert len(found) == told
+    assert all(line.startswith("camera 2 (SIMPLE_RADIAL): its principal point") for line in found)
+    assert all("lie 6.1% of the longer side away" in line for line in found)
 
 
 @pytest.mark.parametrize(
