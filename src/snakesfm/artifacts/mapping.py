@@ -77,13 +77,18 @@ class Reconstruction(Artifact):
     """The adjusted model: cameras, poses, points and observations."""
 
     kind: ClassVar[str] = "reconstruction"
-    format_version: ClassVar[int] = 4
+    format_version: ClassVar[int] = 5
 
     camera_models: Array = column("(C)", "str", "COLMAP camera model name")
     camera_sizes: Array = column("(C,2)", "int32", "width and height in pixels")
     camera_params: Array = column("(C,16)", "float64", "COLMAP parameters in pixels, padded with NaN")
     camera_resets: Array = column(
         "(C)", "str", "implausible parameter for which the last pass reset and fixed the camera; else empty"
+    )
+    camera_offsets: Array = column(
+        "(C)",
+        "float64",
+        "how far off a principal point seems that was left, relative to the longer side",
     )
     rotations: Array = column("(N,3,3)", "float64", "cam_from_world; NaN where not registered")
     translations: Array = column("(N,3)", "float64", "cam_from_world; NaN where not registered")

@@ -1,23 +1,52 @@
 """Selection of the cameras whose principal points the model determines."""
 
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from snakesfm.bundle.interface import BundleAdjuster, SolverSettings
+from snakesfm.bundle.reading import read_tracks_and_pixels
 from snakesfm.geometry.colmap_binding import pycolmap
 from snakesfm.geometry.lens_fit import MIN_IMAGES
+from snakesfm.grouping import rows_of_each
 
 Array = NDArray[Any]
 
 # what is no farther than this many gaps from where it is assumed may as well be there
 SIGNIFICANCE = 3.0
+# the way of a far one is long, and neither half has gone it to the end
+FAR_SIGNIFICANCE = 10.0
 # more points than this tell no more of a few numbers, and cost time
 POINTS_PER_HALF = 5000
 COARSE = 10.0
+# a third of the image cut off on one side makes a quarter; the border is at a half
+LARGEST_OFFSET = 0.35
+FAR_OFFSET = 0.02
+FAR_SHARE = 0.9
+"""Of the errors, what a far principal point must leave at most. Those of images that were cropped leave .24
+to .85 of them; one that makes up for another distortion than the model's, .93."""
+
+
+@dataclass(frozen=True)
+class ToldCameras:
+    """The cameras, by their ids, whose principal point a model tells.
+
+    Parameters
+    ----------
+    told, refused : how far from where it is assumed the principal point seems to be, as a share of the
+        image's longer side, where that is believed, and where it is too far for how little the errors fall.
+    """
+
+    told: Mapping[int, float]
+    refused: Mapping[int, float]
+
+    @property
+    def moves_far(self) -> bool:
+        """Whether a principal point is so far off that the model before was bent and lost observations."""
+        return max(self.told.values(), default=0.0) > FAR_OFFSET
 
 
 def find_told_cameras(
@@ -26,37 +55,53 @@ def find_told_cameras(
     solving: SolverSettings,
     max_gap: float,
     offsets: tuple[float, float],
-) -> frozenset[int]:
-    """Ids of the cameras whose principal point is the same by either half of the points.
+) -> ToldCameras:
+    """Cameras whose principal point is the same by either half of the points.
 
     The points are dealt into two halves, and each half adjusts a copy of the model with the principal
     points free. The formal covariance would be several times too small: neighbouring points err alike.
+
+    Both halves share what the model as a whole gets wrong. So small offsets prove nothing, and large ones,
+    as of images that were all cropped alike, must lower the errors clearly. No offset may raise them.
 
     Parameters
     ----------
     reconstruction : an adjusted model; stays as it is.
     adjust, solving : the solver; cameras that it holds are no candidates.
-    max_gap : largest distance of the two principal points, as a share of the image's longer side.
-    offsets : smallest and largest distance from the principal point so far, likewise; it must be three gaps
-        too. Both halves share what the model as a whole gets wrong, so small distances prove nothing.
+    max_gap : largest distance of the two principal points, as a share of the image's longer side; a tenth
+        of the way from the principal point so far is allowed too.
+    offsets : smallest distance from the principal point so far, likewise, which must be three gaps too, and
+        the one from which on the errors must fall clearly.
     """
     candidates = shared_cameras(reconstruction, solving.constant_cameras)
     if not candidates:
-        return frozenset()
+        return ToldCameras({}, {})
     held = frozenset(reconstruction.cameras) - candidates
     free = replace(solving, constant_cameras=held, refine_principal_points=True)
-    found = [_of_half(reconstruction, half, adjust, free) for half in (0, 1)]
-    told = set()
-    for camera_id in candidates:
+    halves = [_adjusted_half(reconstruction, half, adjust, free) for half in (0, 1)]
+    steady = {}
+    for camera_id in sorted(candidates):
         camera = reconstruction.camera(camera_id)
-        first, second = (points[camera_id] for points in found)
+        first, second = (principal_point(half.camera(camera_id)) for half in halves)
         gap = float(np.linalg.norm(first - second))
         offset = float(np.linalg.norm(0.5 * (first + second) - principal_point(camera)))
         longer = max(camera.width, camera.height)
-        smallest = max(SIGNIFICANCE * gap, offsets[0] * longer)
-        if gap < max_gap * longer and smallest < offset < offsets[1] * longer:
-            told.add(camera_id)
-    return frozenset(told)
+        steady_gap = max(max_gap * longer, offset / FAR_SIGNIFICANCE)
+        if gap < steady_gap and offset > max(SIGNIFICANCE * gap, offsets[0] * longer):
+            steady[camera_id] = offset / longer
+    if not steady:
+        return ToldCameras({}, {})
+    fixed = _adjusted_half(reconstruction, 0, adjust, replace(free, refine_principal_points=False))
+    before, after = _median_errors(fixed), _median_errors(halves[0])
+    told, refused = {}, {}
+    for camera_id, offset in steady.items():
+        near = offset < offsets[1]
+        share = 1.0 if near else FAR_SHARE
+        if after[camera_id] < share * before[camera_id] and (near or offset < LARGEST_OFFSET):
+            told[camera_id] = offset
+        elif not near:
+            refused[camera_id] = offset
+    return ToldCameras(told, refused)
 
 
 def principal_point(camera: pycolmap.Camera) -> Array:
@@ -71,10 +116,10 @@ def shared_cameras(reconstruction: pycolmap.Reconstruction, held: frozenset[int]
     return frozenset(ids[counts >= MIN_IMAGES].tolist()) - held
 
 
-def _of_half(
+def _adjusted_half(
     reconstruction: pycolmap.Reconstruction, half: int, adjust: BundleAdjuster, solving: SolverSettings
-) -> dict[int, Array]:
-    """Principal points by camera that one half of the points gives."""
+) -> pycolmap.Reconstruction:
+    """A copy of the model of one half of the points, adjusted."""
     model = pycolmap.Reconstruction(reconstruction)
     points = sorted(model.point3D_ids())
     kept = set(points[half :: max(2, len(points) // POINTS_PER_HALF)])
@@ -82,4 +127,16 @@ def _of_half(
         if point not in kept:
             model.delete_point3D(point)
     adjust(model, replace(solving, function_tolerance=solving.function_tolerance * COARSE))
-    return {camera_id: principal_point(camera) for camera_id, camera in model.cameras.items()}
+    return model
+
+
+def _median_errors(reconstruction: pycolmap.Reconstruction) -> dict[int, float]:
+    """Median reprojection errors in pixels, by the ids of the cameras that have observations."""
+    tracks, pixels = read_tracks_and_pixels(reconstruction)
+    camera_of, errors = np.empty(len(pixels), dtype=np.int64), np.empty(len(pixels))
+    for row, mine in rows_of_each(tracks.images):
+        image = reconstruction.image(row + 1)
+        in_camera = image.cam_from_world() * tracks.points[tracks.point_rows[mine]]
+        camera_of[mine] = image.camera_id
+        errors[mine] = np.linalg.norm(image.camera.img_from_cam(in_camera) - pixels[mine], axis=1)
+    return {int(camera_id): float(np.median(errors[mine])) for camera_id, mine in rows_of_each(camera_of)}

@@ -59,6 +59,8 @@ class RoundRecord:
 
     Where nothing was adjusted, the costs are that of the pass before. ``wild`` tells by the camera's id
     what was not plausible of cameras that were reset, and ``held`` the same of those that are held since.
+    ``far`` tells by the camera's id how far from where it is left the principal point seems to be, as a
+    share of the longer side, where that was not believed.
     """
 
     name: str
@@ -67,3 +69,4 @@ class RoundRecord:
     error_px: float
     wild: Mapping[int, WildCause]
     held: Mapping[int, WildCause]
+    far: Mapping[int, float]

@@ -82,7 +82,7 @@ def adjust_rounds(
     while settings.register_images and mapper.register():
         mapper.round("registration", settings.thresholds_px[-1], "final")
     if settings.refine_principal_points and settings.solver == "ceres":
-        mapper.refine_principal_points()
+        mapper.refine_principal_points(sources)
     mapper.drop_outliers()
     if settings.register_images:
         mapper.set_long_lenses_aside()
@@ -112,6 +112,7 @@ class _Mapper:
         self.report = report
         self.records: list[RoundRecord] = []
         self.registered_late: set[int] = set()
+        self.far_principal_points: Mapping[int, float] = {}
         self.adjust = bundle_adjuster(settings.solver)
         self.held_graph: pycolmap.CorrespondenceGraph | None = None
 
@@ -236,6 +237,7 @@ class _Mapper:
             float(self.reconstruction.compute_mean_reprojection_error()),
             wild,
             held,
+            self.far_principal_points,
         )
         self.records.append(record)
         self.report(record)
@@ -252,22 +254,30 @@ class _Mapper:
             return self.adjust(self.reconstruction, solving)
         return adjust_selection(self.reconstruction, self.adjust, solving, per_image, settings.seed)
 
-    def refine_principal_points(self) -> None:
-        """One more round in which the principal points that the model tells are free."""
+    def refine_principal_points(self, sources: Sequence[ImageSource]) -> None:
+        """One more round in which the principal points that the model tells are free, or two.
+
+        Where one moved far, observations that the former model had bent or lost come back in the second.
+        """
+        settings = self.settings
         solving = replace(self.solving, loss_scale_px=self.loss_scale_px())
-        told = find_told_cameras(
+        found = find_told_cameras(
             self.reconstruction,
             self.adjust,
             solving,
-            self.settings.max_principal_point_gap,
-            (self.settings.min_principal_point_offset, self.settings.max_principal_point_offset),
+            settings.max_principal_point_gap,
+            (settings.min_principal_point_offset, settings.max_principal_point_offset),
         )
-        if not told:
+        self.far_principal_points = found.refused
+        if not found.told:
             return
         before = self.solving
-        held = frozenset(self.reconstruction.cameras) - told
+        held = frozenset(self.reconstruction.cameras).difference(found.told)
         self.solving = replace(before, constant_cameras=held, refine_principal_points=True)
-        self.round("principal points", self.settings.thresholds_px[-1], "final")
+        self.round("principal points", settings.thresholds_px[-1], "final")
+        if found.moves_far:
+            self.prepare(settings.complete_tracks, sources)
+            self.round("principal points again", settings.thresholds_px[-1], "final")
         self.solving = before
 
     def drop_outliers(self) -> None:

@@ -11,7 +11,7 @@ from snakesfm.config.base import StageOptions
 class AdjustBundleOptions(StageOptions):
     """How cameras, poses and points are adjusted together."""
 
-    stage_version: ClassVar[int] = 16
+    stage_version: ClassVar[int] = 17
 
     solver: Literal["ceres", "gtsam"] = "ceres"
     """Least-squares solver: Ceres through pycolmap, or gtsam (slower, fewer camera models)."""
@@ -61,15 +61,15 @@ class AdjustBundleOptions(StageOptions):
 
     max_principal_point_gap: float = Field(default=0.003, gt=0.0, le=1.0)
     """Largest difference, relative to the longer side, between the principal points estimated from two
-    halves of the points."""
+    halves of the points; a tenth of the distance moved is allowed as well."""
 
     min_principal_point_offset: float = Field(default=0.004, ge=0.0, le=1.0)
     """A principal point is left unchanged if it would move by less than this, relative to the longer
     side."""
 
     max_principal_point_offset: float = Field(default=0.02, gt=0.0, le=1.0)
-    """A principal point is left unchanged if it would move by more than this, relative to the longer
-    side."""
+    """A principal point that would move by more than this, relative to the longer side, must clearly lower
+    the reprojection errors, or it is left unchanged with a warning."""
 
     max_focal_change: float = Field(default=3.0, gt=1.0)
     """Factor by which a focal length that is given or from EXIF may change before the camera is reset

@@ -10,7 +10,7 @@ from snakesfm.config.base import StageOptions
 class ExtractFeaturesOptions(StageOptions):
     """How keypoints are found and described."""
 
-    stage_version: ClassVar[int] = 4
+    stage_version: ClassVar[int] = 5
 
     method: Literal["sift", "aliked", "disk", "xfeat", "superpoint", "virtual", "imported"] = "sift"
     """SIFT with RootSIFT descriptors, a network, an oracle, or hloc's file; see docs/front_ends.md."""

@@ -6,24 +6,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from snakesfm.geometry.camera import Camera
+from snakesfm.geometry.camera import WIDE_MODELS, Camera
 from snakesfm.geometry.poses import center_of
 
 Array = NDArray[Any]
 PERSPECTIVE_TERMS = ("k1", "k2", "k3", "p1", "p2")
 FISHEYE_TERMS = ("k1", "k2", "k3", "k4")
-# of wide lenses: terms of the angle come within a pixel or two up to 90 degrees, terms of the plane do not
-WIDE_MODELS = frozenset({"FOV", "EUCM", "SIMPLE_DIVISION", "DIVISION"})
 GRID = 25
 ROUND_TRIP_PX = 0.5
 FIT_PX = 0.5
 # of the grid's pixels, a tenth: fewer tell no lens
 LEAST_PIXELS = GRID**2 // 10
-
-
-def is_fisheye(camera: Camera) -> bool:
-    """Whether nerfstudio is told of distortion that is a function of the angle to the optical axis."""
-    return "FISHEYE" in camera.model or camera.model in WIDE_MODELS
 
 
 def transforms(
@@ -91,7 +84,7 @@ def camera_intrinsics(camera: Camera) -> dict[str, Any]:
     """
     matrix = camera.to_pycolmap().calibration_matrix()
     content: dict[str, Any] = {
-        "camera_model": "OPENCV_FISHEYE" if is_fisheye(camera) else "OPENCV",
+        "camera_model": "OPENCV_FISHEYE" if camera.is_fisheye else "OPENCV",
         "w": camera.width,
         "h": camera.height,
         "fl_x": float(matrix[0, 0]),
@@ -136,7 +129,7 @@ def camera_warnings(camera: Camera, camera_id: int) -> list[str]:
 
 
 def _term_names(camera: Camera) -> tuple[str, ...]:
-    return FISHEYE_TERMS if is_fisheye(camera) else PERSPECTIVE_TERMS
+    return FISHEYE_TERMS if camera.is_fisheye else PERSPECTIVE_TERMS
 
 
 def _native_terms(camera: Camera) -> dict[str, float] | None:
@@ -180,7 +173,7 @@ def _fit_terms(camera: Camera) -> tuple[float, list[float], float] | None:
     distorted = (pixels[held] - matrix[:2, 2]) / focal
     x, y = rays[held].T
     squared = x**2 + y**2
-    if is_fisheye(camera):
+    if camera.is_fisheye:
         radius = np.sqrt(squared)
         theta = np.arctan(radius)
         ratio = np.divide(theta, radius, out=np.ones_like(theta), where=radius > 0)

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from snakesfm.errors import ImageError
+from snakesfm.geometry.camera import Camera
 from snakesfm.geometry.colmap_binding import pycolmap
 from snakesfm.ingest.masks import find_mask, read_mask
 
@@ -18,6 +19,7 @@ Array = NDArray[Any]
 JPEG_SUFFIXES = (".jpg", ".jpeg")
 # COLMAP takes less for none, and it moves no pixel by a thousandth
 LEAST_DISTORTION = 1e-7
+GRID = 50
 
 
 def write_undistorted(target: Path, sparse: Path, images: Path, masks: Path | None, threads: int) -> None:
@@ -64,6 +66,25 @@ def write_undistorted(target: Path, sparse: Path, images: Path, masks: Path | No
     shutil.rmtree(target / "stereo")
     for script in target.glob("run-colmap-*.sh"):
         script.unlink()
+
+
+def undistorted_share(camera: Camera) -> float:
+    """The share of a camera's picture that is left of it without distortion.
+
+    COLMAP makes it as large as the edges tell. Where a lens sees more than 180 degrees, they have no rays,
+    and the picture may become a thumbnail.
+    """
+    source = camera.to_pycolmap()
+    _replace_undistorted(source)
+    if source.model_name == "PINHOLE":
+        return 1.0
+    flat = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), source)
+    columns, rows = np.meshgrid(
+        (np.arange(GRID) + 0.5) * camera.width / GRID, (np.arange(GRID) + 0.5) * camera.height / GRID
+    )
+    rays = camera.normalize(np.column_stack([columns.ravel(), rows.ravel()]))
+    pixels = np.asarray(flat.img_from_cam(np.column_stack([rays, np.ones(len(rays))])))
+    return float(((pixels >= 0) & (pixels <= [flat.width, flat.height])).all(axis=1).mean())
 
 
 def _replace_undistorted(camera: "pycolmap.Camera") -> None:

@@ -16,6 +16,8 @@ if TYPE_CHECKING:
 Array = NDArray[Any]
 PARAM_SLOTS = 16
 ROUND_TRIP_PX = 1.0
+WIDE_MODELS = frozenset({"FOV", "EUCM", "SIMPLE_DIVISION", "DIVISION"})
+"""Without FISHEYE in their names, and still of lenses that may see 90 degrees off their axis and more."""
 
 
 @dataclass(frozen=True)
@@ -60,11 +62,16 @@ class Camera:
             return np.zeros((0, 2))
         camera, pixels = self.to_pycolmap(), np.asarray(keypoints, dtype=np.float64)
         points = np.asarray(camera.cam_from_img(pixels)).reshape(-1, 2)
-        if "FISHEYE" in self.model:
+        if self.is_fisheye:
             # of angles beyond 90 degrees, which no plane holds, COLMAP gives some point of it
             again = np.asarray(camera.img_from_cam(np.column_stack([points, np.ones(len(points))])))
             points[~(np.linalg.norm(again.reshape(-1, 2) - pixels, axis=1) < ROUND_TRIP_PX)] = np.nan
         return points
+
+    @property
+    def is_fisheye(self) -> bool:
+        """Whether the model is one of lenses that may see 90 degrees off their axis and more."""
+        return "FISHEYE" in self.model or self.model in WIDE_MODELS
 
     @property
     def focal_px(self) -> float:

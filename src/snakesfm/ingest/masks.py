@@ -38,26 +38,25 @@ def masks_as_large(folder: Path, sizes: Mapping[str, tuple[int, int]]) -> dict[s
 
 
 def read_mask(path: Path, size: tuple[int, int]) -> "NDArray[Any]":
-    """Where keypoints are wanted, (H,W) bool, of an image of a width and height.
+    """Where keypoints are wanted, (H,W) bool, of an image of a width and height: where it is not black.
 
-    The mask may be larger or smaller than the image.
+    A small number of an instance in 16 bits is not black. The mask may be larger or smaller than the image.
 
     Raises
     ------
     ConfigError : it cannot be decoded, or its aspect is another than the image's.
     """
     from snakesfm.errors import ImageError
-    from snakesfm.ingest.read import read_image
+    from snakesfm.ingest.read import read_not_black
 
     try:
-        gray = read_image(path).gray
+        wanted = read_not_black(path)
     except ImageError as error:
         raise ConfigError(f"A mask cannot be used: {error}") from None
-    height, width = gray.shape
+    height, width = wanted.shape
     if abs(width * size[1] / (height * size[0]) - 1.0) > MAX_ASPECT_DIFFERENCE:
         raise ConfigError(
             f"The mask {path} has {width} x {height} pixels, but its image {size[0]} x {size[1]}: give a "
             "mask of the whole image, in the orientation in which the image is stored."
         )
-    wanted: NDArray[Any] = gray > 0
     return wanted

@@ -6,7 +6,10 @@ belong to the sensor's own grid, and portrait and landscape photographs of one c
 """
 
 import mmap
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -36,14 +39,14 @@ MINIMUM_SIDE_PX = 32
 # far beyond any camera, and still read in a few GB
 MAXIMUM_PIXELS = 1 << 30
 # PIL applies the orientation of TIFF files, and only of these
-UNDO_TURN = {
-    2: Image.Transpose.FLIP_LEFT_RIGHT,
-    3: Image.Transpose.ROTATE_180,
-    4: Image.Transpose.FLIP_TOP_BOTTOM,
-    5: Image.Transpose.TRANSPOSE,
-    6: Image.Transpose.ROTATE_90,
-    7: Image.Transpose.TRANSVERSE,
-    8: Image.Transpose.ROTATE_270,
+UNDO_TURN: dict[int, Callable[[Array], Array]] = {
+    2: np.fliplr,
+    3: partial(np.rot90, k=2),
+    4: np.flipud,
+    5: partial(np.swapaxes, axis1=0, axis2=1),
+    6: np.rot90,
+    7: lambda pixels: np.rot90(pixels, 2).swapaxes(0, 1),
+    8: partial(np.rot90, k=3),
 }
 # what stands for no value in pictures of floating-point numbers
 NO_VALUES = (-9999.0, -32767.0, -32768.0)
@@ -105,25 +108,27 @@ def read_image(path: Path | str, shorter_side_px: int | None = None) -> ImagePix
     ------
     ImageError : as :func:`read_header`, or the pixels cannot be decoded to the last.
     """
-    with _open(path) as image:
-        _check_end(Path(path), image)
-        try:
-            if image.format in ("JPEG", "MPO") and image.mode in ("RGB", "L"):
-                return _decode_jpeg(Path(path), min(image.size), shorter_side_px)
-            turn_back = UNDO_TURN.get(_tiff_orientation(image))
-            # loading drops what tells the depth, but no damage passes it
-            layout = _layout_of_deep_colours(image)
-            # colours of RGBa are multiplied by alpha already
-            transparent = image.has_transparency_data and "RGBa" not in layout
-            image.load()
-            if layout:
-                image = Image.fromarray(_decode_deep(Path(path), transparent))
-            return _to_pixels(image if turn_back is None else image.transpose(turn_back))
-        # PIL raises errors of every type on damaged files, and one bad image must not stop the others
-        except Exception as error:
-            raise ImageError(
-                f"{path} is damaged ({error}): replace it by an intact copy or remove it."
-            ) from error
+    with _decoding(path) as image:
+        if image.format in ("JPEG", "MPO") and image.mode in ("RGB", "L"):
+            return _decode_jpeg(Path(path), min(image.size), shorter_side_px)
+        values = _decode_stored(Path(path), image)
+        if values.dtype != np.uint8:
+            values = _to_8_bit(values)
+        return _from_gray(values) if values.ndim == 2 else _from_rgb(values)
+
+
+def read_not_black(path: Path | str) -> Array:
+    """Where an image as stored is not black, (H,W) bool, be it by one of many gray levels in one colour.
+
+    Alpha is composed over black, and what stands for no value is black, as in :func:`read_image`.
+
+    Raises
+    ------
+    ImageError : as :func:`read_image`.
+    """
+    with _decoding(path) as image:
+        lit = _decode_stored(Path(path), image) > 0
+        return np.asarray(lit if lit.ndim == 2 else lit.any(axis=2))
 
 
 def scale_down(pixels: Array, shorter_side_px: int) -> Array:
@@ -170,6 +175,20 @@ def _open(path: Path | str) -> Image.Image:
         image.close()
         raise ImageError(f"{path} has {width} x {height} pixels, which is too large: scale it down.")
     return image
+
+
+@contextmanager
+def _decoding(path: Path | str) -> Iterator[Image.Image]:
+    """The opened and checked image; what goes wrong with it is an ImageError."""
+    with _open(path) as image:
+        _check_end(Path(path), image)
+        try:
+            yield image
+        # PIL raises errors of every type on damaged files, and one bad image must not stop the others
+        except Exception as error:
+            raise ImageError(
+                f"{path} is damaged ({error}): replace it by an intact copy or remove it."
+            ) from error
 
 
 def _check_end(path: Path, image: Image.Image) -> None:
@@ -256,25 +275,35 @@ def _layout_of_deep_colours(image: Image.Image) -> str:
     return next((str(tile[3]) for tile in image.tile if ";16" in str(tile[3])), "")
 
 
+def _decode_stored(path: Path, image: Image.Image) -> Array:
+    """Gray (H,W) or colours (H,W,3) of an opened image in the file's depth, alpha composed over black."""
+    turn_back = UNDO_TURN.get(_tiff_orientation(image))
+    # loading drops what tells the depth, but no damage passes it
+    layout = _layout_of_deep_colours(image)
+    # colours of RGBa are multiplied by alpha already
+    transparent = image.has_transparency_data and "RGBa" not in layout
+    image.load()
+    values = _decode_deep(path, transparent) if layout else _decoded_values(image)
+    return values if turn_back is None else np.ascontiguousarray(turn_back(values))
+
+
 def _decode_deep(path: Path, transparent: bool) -> Array:
-    """Colours of 16 bits as uint8 (H,W,3), turned as PIL turns them; ``transparent``: over black."""
+    """Colours (H,W,3) of 16 bits, turned as PIL turns them; ``transparent``: over black."""
     colours = _decode(path, cv2.IMREAD_UNCHANGED)
     rgb = colours[..., 2::-1]
     if transparent:
         rgb = rgb.astype(np.uint32) * colours[..., 3:] // np.iinfo(colours.dtype).max
-    return _to_8_bit(rgb)
+    return rgb
 
 
-def _to_pixels(image: Image.Image) -> ImagePixels:
+def _decoded_values(image: Image.Image) -> Array:
     if image.mode.startswith(("I", "F")):
-        return _from_gray(_to_8_bit(np.asarray(image)))
+        return np.asarray(image)
     if image.has_transparency_data:
         rgba = image if image.mode == "RGBA" else image.convert("RGBA")
         black = Image.new("RGBA", rgba.size, (0, 0, 0, 255))
-        return _from_rgb(np.asarray(Image.alpha_composite(black, rgba).convert("RGB")))
-    if image.mode in ("1", "L"):
-        return _from_gray(np.asarray(image.convert("L")))
-    return _from_rgb(np.asarray(image.convert("RGB")))
+        return np.asarray(Image.alpha_composite(black, rgba).convert("RGB"))
+    return np.asarray(image.convert("L" if image.mode in ("1", "L") else "RGB"))
 
 
 def _from_gray(gray: Array) -> ImagePixels:

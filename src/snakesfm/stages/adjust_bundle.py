@@ -77,6 +77,7 @@ def run(job: StageJob) -> None:
     adjusted: list[tuple[BundleModel, np.ndarray]] = []
     records: list[RoundRecord] = []
     resets: dict[int, WildCause] = {}
+    far: dict[int, float] = {}
     for component in range(int(averaged.components.max(initial=0)) + 1):
         mine = (averaged.components == component) & ~taken
         part = restrict_to(replace(poses, cameras=cameras), mine)
@@ -93,6 +94,7 @@ def run(job: StageJob) -> None:
         result, observed, rounds = _adjust(job, index, part, graph, refused, taken, prefix)
         records += rounds
         resets |= rounds[-1].held
+        far |= rounds[-1].far
         cameras = result.cameras
         if result.registered.sum() >= 2:
             adjusted.append((result, observed))
@@ -109,7 +111,7 @@ def run(job: StageJob) -> None:
     joined, models = join_models([found for found, _ in adjusted], final)
     pixels = np.concatenate([observed for _, observed in adjusted])
     scales = detector_scales(index.sizes, job.settings).astype(np.float32)
-    _write(job, joined, models, pixels * scales[joined.image_ids, None], records, resets)
+    _write(job, joined, models, pixels * scales[joined.image_ids, None], records, resets, far)
 
 
 def _adjust(
@@ -245,16 +247,19 @@ def _write(
     observed: np.ndarray,
     records: list[RoundRecord],
     resets: dict[int, WildCause],
+    far: dict[int, float],
 ) -> None:
     (colors,) = gather_image_columns(job.paths("features"), len(model.camera_ids), "colors")
     base = np.r_[0, np.cumsum([len(k) for k in colors])]
     rows = base[model.image_ids] + model.keypoint_ids
     camera_models, sizes, params, _ = cameras_to_columns(model.cameras)
+    ids = range(1, len(model.cameras) + 1)
     Reconstruction(
         camera_models=np.array(camera_models),
         camera_sizes=sizes,
         camera_params=params,
-        camera_resets=np.array([resets.get(row + 1, "") for row in range(len(model.cameras))]),
+        camera_resets=np.array([resets.get(camera_id, "") for camera_id in ids]),
+        camera_offsets=np.array([far.get(camera_id, np.nan) for camera_id in ids]),
         rotations=model.rotations,
         translations=model.translations,
         models=models,

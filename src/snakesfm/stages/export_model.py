@@ -17,10 +17,10 @@ from snakesfm.export.colmap import (
     registered_images,
     summarize,
 )
-from snakesfm.export.georeference import Georeference, georeference
+from snakesfm.export.georeference import LEAST_IMAGES, Georeference, georeference
 from snakesfm.export.image_folder import place_images
-from snakesfm.export.nerfstudio import camera_warnings, is_fisheye, transforms
-from snakesfm.export.undistorted import write_undistorted
+from snakesfm.export.nerfstudio import camera_warnings, transforms
+from snakesfm.export.undistorted import undistorted_share, write_undistorted
 from snakesfm.geometry.camera import Camera, cameras_from_columns
 from snakesfm.geometry.earth import local_origin
 from snakesfm.geometry.lens_fit import MAX_MISFIT, fit_lenses
@@ -68,12 +68,30 @@ RESET_CAMERA = (
     "was reset and kept fixed; try an index_images.camera_model with fewer parameters, or other intrinsics."
 )
 
+FAR_PRINCIPAL_POINT = (
+    "camera {camera} ({model}): its principal point seems to lie {offset:.1%} of the longer side away from "
+    "where it is assumed, but reprojection errors hardly fall there, so it was left; if the images were "
+    "cropped, give cameras=, or raise adjust_bundle.max_principal_point_offset."
+)
+
+CUT_PICTURE = (
+    "camera {camera} ({model}): undistorted/ shows only {share:.0%} of its images, because no flat image "
+    "holds a view of about 180 degrees: use images/ and sparse/0 with software for fisheye lenses."
+)
+
+# of a picture, what is left of it without distortion: normal lenses keep 0.8 and more
+LEAST_UNDISTORTED = 0.5
 # more of them add nothing about a lens
 OBSERVATIONS_OF_LENSES = 500_000
 
 NO_PLACE = (
     "georeference is true, but fewer than four registered images have GPS in EXIF, or it does not agree "
     "with the model: the model is not georeferenced."
+)
+
+NO_ALTITUDE = (
+    "georeference is true, but {count} registered images have GPS without altitude in EXIF, and fewer than "
+    "four with it: write GPSAltitude into EXIF."
 )
 
 UNTRUSTED_PLACE = (
@@ -99,8 +117,17 @@ def run(job: StageJob) -> None:
         for row in used
         if adjusted.camera_resets[row]
     ]
+    warnings += [
+        FAR_PRINCIPAL_POINT.format(
+            camera=row + 1, model=cameras[row].model, offset=adjusted.camera_offsets[row]
+        )
+        for row in used
+        if np.isfinite(adjusted.camera_offsets[row])
+    ]
     warnings += _lens_warnings(model, cameras, index.camera_ids)
-    if len({is_fisheye(cameras[row]) for row in used}) > 1:
+    if job.options.undistort:
+        warnings += _cut_warnings({row: cameras[row] for row in used})
+    if len({cameras[row].is_fisheye for row in used}) > 1:
         warnings.append(MIXED_LENSES)
     if any(" " in names[row] for row in registered):
         warnings.append(SPACES)
@@ -112,7 +139,10 @@ def run(job: StageJob) -> None:
     warnings += [str(line) for line in index.warnings]
     warnings += [str(line) for line in CalibratedCameras.read(job.path("cameras")).warnings]
     if job.options.georeference is True and place is None:
-        warnings.append(NO_PLACE)
+        known = np.isfinite(index.gps[registered])
+        told, flat = int(known.all(axis=1).sum()), int(known[:, :2].all(axis=1).sum())
+        lacking = told < min(LEAST_IMAGES, flat)
+        warnings.append(NO_ALTITUDE.format(count=flat - told) if lacking else NO_PLACE)
     if place is not None and not place.trusted:
         warnings.append(UNTRUSTED_PLACE.format(inliers=place.inliers, images=place.images))
     copies = int(np.count_nonzero(index.duplicate_of >= 0))
@@ -176,6 +206,16 @@ def _lens_warnings(model: Reconstruction, cameras: list[Camera], camera_ids: np.
         OTHER_LENS.format(camera=row + 1, model=cameras[row].model)
         for row, fit in fits.items()
         if fit.misfit > MAX_MISFIT
+    ]
+
+
+def _cut_warnings(cameras: dict[int, Camera]) -> list[str]:
+    """One sentence per camera, given by its row, of whose pictures little is left without distortion."""
+    shares = {row: undistorted_share(camera) for row, camera in cameras.items()}
+    return [
+        CUT_PICTURE.format(camera=row + 1, model=cameras[row].model, share=share)
+        for row, share in shares.items()
+        if share < LEAST_UNDISTORTED
     ]
 
 

@@ -99,9 +99,13 @@ def write_cameras(folder: Path) -> Path:
 
 
 def write_reconstruction(
-    folder: Path, problem: SyntheticProblem, lost: Iterable[int] = (LOST,), reset: str = ""
+    folder: Path,
+    problem: SyntheticProblem,
+    lost: Iterable[int] = (LOST,),
+    reset: str = "",
+    offset: float = np.nan,
 ) -> Path:
-    """The truth as a finished model, ``lost`` images not registered, the second camera's ``reset`` held."""
+    """The truth as a finished model, ``lost`` images not registered; what is wrong with the second camera."""
     rotations, translations = problem.rotations.copy(), problem.translations.copy()
     rotations[list(lost)], translations[list(lost)] = np.nan, np.nan
     keep = ~np.isin(problem.track_image_ids, list(lost))
@@ -114,6 +118,7 @@ def write_reconstruction(
         camera_sizes=sizes,
         camera_params=params,
         camera_resets=["", reset],
+        camera_offsets=np.array([np.nan, offset]),
         rotations=rotations,
         translations=translations,
         models=np.where(np.isin(np.arange(COUNT), list(lost)), -1, 0),
@@ -147,12 +152,13 @@ def export(
     gps: np.ndarray | None = None,
     masks: Path | None = None,
     reset: str = "",
+    offset: float = np.nan,
     **options: bool,
 ) -> Path:
     inputs = {
         "index": str(write_index(tmp_path, orientations, gps)),
         "cameras": str(write_cameras(tmp_path)),
-        "reconstruction": str(write_reconstruction(tmp_path, problem, lost, reset)),
+        "reconstruction": str(write_reconstruction(tmp_path, problem, lost, reset, offset)),
     }
     folder = tmp_path / "out" / "scene" / "export_model"
     images = tmp_path / "photos"
@@ -292,6 +298,14 @@ def test_the_world_stays_where_positions_contradict_it_or_are_not_wanted(tmp_pat
     summary = json.loads((asked / "summary.json").read_text())
     assert summary["georeference"] is None
     assert any("GPS in EXIF" in line for line in summary["warnings"])
+    gps = gps_of(problem, 0.5)
+    gps[3:, 2] = np.nan
+    flat = export(tmp_path / "flat", problem, gps=gps, georeference=True)
+    summary = json.loads((flat / "summary.json").read_text())
+    assert summary["georeference"] is None
+    # of nine images one is not registered
+    (line,) = (line for line in summary["warnings"] if "georeference is true" in line)
+    assert "but 5 registered images have GPS without altitude" in line and "GPSAltitude" in line
 
 
 def test_images_are_one_relative_link_and_a_second_run_gives_the_same_bytes(tmp_path, problem) -> None:
@@ -357,6 +371,42 @@ def test_a_camera_that_was_reset_and_held_is_warned_of(tmp_path, problem, reset:
     found = [line for line in summary["warnings"] if "reset and kept fixed" in line]
     assert len(found) == told
     assert all(line.startswith("camera 2 (SIMPLE_RADIAL): its distortion was") for line in found)
+
+
+@pytest.mark.parametrize(("offset", "told"), [(np.nan, 0), (0.0614, 1)])
+def test_a_far_principal_point_that_was_left_is_warned_of(
+    tmp_path, problem, offset: float, told: int
+) -> None:
+    folder = export(tmp_path, problem, offset=offset)
+    summary = json.loads((folder / "summary.json").read_text("utf-8"))
+    found = [line for line in summary["warnings"] if "max_principal_point_offset" in line]
+    assert len(found) == told
+    assert all(line.startswith("camera 2 (SIMPLE_RADIAL): its principal point") for line in found)
+    assert all("lie 6.1% of the longer side away" in line for line in found)
+
+
+@pytest.mark.parametrize(
+    ("lens", "told"),
+    [(CAMERA, 0), (dataclasses.replace(CAMERA, model="FOV", params=(250.0, 250.0, 320.0, 240.0, 1.4)), 2)],
+    ids=["usual", "beyond 180 degrees"],
+)
+def test_pictures_of_which_little_is_left_without_distortion_are_warned_of(
+    tmp_path, monkeypatch, lens: Camera, told: int
+) -> None:
+    monkeypatch.setattr(sys.modules[__name__], "CAMERA", lens)
+    usual = Camera("PINHOLE", 640, 480, (500.0, 500.0, 320.0, 240.0))
+    seen = make_problem(camera_count=COUNT, point_count=300, noise_px=0.3, camera=usual)
+    photos = tmp_path / "photos"
+    for name in NAMES:
+        (photos / name).parent.mkdir(parents=True, exist_ok=True)
+        Image.new("RGB", (640, 480), "red").save(photos / name)
+    for undistort, count in ((False, 0), (True, told)):
+        summary = json.loads(
+            (export(tmp_path, seen, undistort=undistort) / "summary.json").read_text("utf-8")
+        )
+        found = [line for line in summary["warnings"] if "undistorted/ shows only" in line]
+        assert len(found) == count
+        assert all(line.startswith(f"camera {row} (FOV)") for row, line in enumerate(found, start=1))
 
 
 def test_masks_go_with_the_images_where_all_have_one_of_their_size(tmp_path, problem) -> None:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from snakesfm.export.nerfstudio import camera_intrinsics, camera_warnings, is_fisheye, transforms
+from snakesfm.export.nerfstudio import camera_intrinsics, camera_warnings, transforms
 from snakesfm.geometry.camera import Camera
 
 SIZE = (640, 480)
@@ -100,7 +100,7 @@ def test_wide_lenses_are_fisheye_and_fitted_where_the_image_lies_within_them(
 ) -> None:
     camera = Camera(model, *SIZE, params)
     content = camera_intrinsics(camera)
-    assert is_fisheye(camera)
+    assert camera.is_fisheye
     assert content["camera_model"] == "OPENCV_FISHEYE"
     assert 0.8 * params[0] < content["fl_x"] < 1.25 * params[0]
     pixels = np.random.default_rng(0).uniform(0, 1, (400, 2)) * SIZE
@@ -147,7 +147,7 @@ def test_a_wide_model_is_of_one_kind_with_fisheye_and_not_with_perspective() -> 
             {},
         )
         assert len({frame["camera_model"] for frame in content["frames"]}) == kinds
-        assert len({is_fisheye(camera) for camera in cameras}) == kinds
+        assert len({camera.is_fisheye for camera in cameras}) == kinds
         assert content["frames"][0]["camera_model"] == "OPENCV_FISHEYE"
 
 
