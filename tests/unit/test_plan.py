@@ -8,6 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from snakesfm.blocks import choose_blocks, deal_blocks, tile_names
+from snakesfm.config.configuration import STAGES, options_class
+from snakesfm.digests import file_digest, settings_text
 from snakesfm.errors import ConfigError
 from snakesfm.plan import Plan
 from snakesfm.seeding import derive_seed
@@ -114,3 +116,58 @@ def test_an_output_folder_with_braces_is_refused(tmp_path: Path, output: str) ->
     make_images(tmp_path / "scene", 2)
     with pytest.raises(ConfigError, match="braces"):
         Plan({"images": str(tmp_path / "scene"), "output": str(tmp_path / output)})
+
+
+def params_of(config: dict[str, str]) -> dict[str, str]:
+    """The params of every stage's job, of its first block or tile, as a new run has them."""
+    file_digest.cache_clear()
+    scene = Plan(config).scenes["scene"]
+    parts = {"block": "0", "tile": "0-0"}
+    return {stage: scene.params(stage, parts, True) for stage in STAGES}
+
+
+@pytest.mark.parametrize(
+    ("changed", "stages"),
+    [
+        ("scene/001.jpg", {"index_images"}),
+        ("cameras/cameras.txt", {"index_images"}),
+        ("cameras/images.txt", {"index_images"}),
+        ("masks/001.jpg.png", {"extract_features"}),
+        ("pairs.txt", {"select_pairs"}),
+        ("reference/images.txt", {"evaluate_model"}),
+        ("reference/points3D.bin", {"evaluate_model"}),
+    ],
+)
+def test_other_bytes_of_a_given_file_change_what_its_stage_is_told(
+    tmp_path: Path, changed: str, stages: set[str]
+) -> None:
+    make_images(tmp_path / "scene", 3)
+    config = {"images": str(tmp_path / "scene"), "output": str(tmp_path / "out")}
+    names = ("cameras/cameras.txt", "masks", "pairs.txt", "reference")
+    config |= {Path(name).parts[0].split(".")[0]: str(tmp_path / name) for name in names}
+    for name in ("cameras/cameras.txt", "cameras/images.txt", "masks/001.jpg.png", "pairs.txt"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text("bytes")
+    make_images(tmp_path / "reference", 0)
+    for name in ("images.txt", "points3D.bin"):
+        (tmp_path / "reference" / name).write_text("bytes")
+    before = params_of(config)
+    (tmp_path / changed).write_text("setyb")
+    after = params_of(config)
+    assert {stage for stage in STAGES if before[stage] != after[stage]} == stages
+
+
+@pytest.mark.parametrize("stage", STAGES)
+def test_another_version_of_a_stage_changes_what_it_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stage: str
+) -> None:
+    make_images(tmp_path / "scene", 3)
+    config = {"images": str(tmp_path / "scene"), "output": str(tmp_path / "out")}
+    before = params_of(config)
+    monkeypatch.setattr(options_class(stage), "stage_version", 999)
+    after = params_of(config)
+    assert {other for other in STAGES if before[other] != after[other]} == {stage}
+
+
+def test_settings_of_another_seed_are_others() -> None:
+    assert settings_text({}, 1) == settings_text({"images": "elsewhere"}, 1) != settings_text({}, 2)

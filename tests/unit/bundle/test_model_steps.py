@@ -13,6 +13,7 @@ from snakesfm.bundle.filtering import deregister_weak_images, drop_short_tracks,
 from snakesfm.bundle.interface import SolverSettings
 from snakesfm.bundle.model import BundleModel, from_reconstruction, reprojection_errors, to_reconstruction
 from snakesfm.bundle.registration import register_left_out
+from snakesfm.bundle.rounds import bundle_adjuster, keypoint_noise_px
 from snakesfm.geometry.poses import to_rigid3d, translation_of
 from snakesfm.geometry.rotations import angle_of
 from snakesfm.synthetic.problems import make_problem, perturb_rotations
@@ -119,6 +120,16 @@ def test_points_behind_the_camera_have_infinite_errors():
     assert np.isinf(errors_px(replace(model, translations=model.translations - [0, 0, 1e3]), made)).all()
 
 
+@pytest.mark.parametrize("noise_px", [0.3, 1.0])
+def test_noise_of_keypoints_allows_for_what_points_take_up(noise_px):
+    made = problem(noise_px=noise_px)
+    reconstruction = to_reconstruction(model_of(made), made.keypoints, NAMES)
+    bundle_adjuster("ceres")(
+        reconstruction, SolverSettings(loss="squared", constant_cameras=frozenset(reconstruction.cameras))
+    )
+    assert 0.78 < keypoint_noise_px(reconstruction) / noise_px < 1.02
+
+
 def test_filter_drops_observations_and_not_whole_tracks():
     made = problem(outlier_ratio=0.05)
     model = model_of(made)
@@ -175,6 +186,25 @@ def test_completion_brings_observations_back(min_angle_deg):
     result, _ = from_reconstruction(reconstruction, model)
     assert 0.3 * len(half) < len(result.image_ids) - before < len(half)
     assert errors_px(result, made).max() < 6.0
+
+
+@pytest.mark.parametrize(("max_error_px", "merged"), [(0.5, False), (8.0, True)])
+def test_points_are_merged_where_all_observations_fit(max_error_px, merged):
+    made = problem(noise_px=1.0)
+    model = model_of(made)
+    lengths = np.diff(made.track_offsets)
+    # every track of four or more observations is two points
+    starts = made.track_offsets[:-1]
+    halved = lengths >= 4
+    offsets = np.unique(np.r_[made.track_offsets, starts[halved] + lengths[halved] // 2])
+    points = np.repeat(made.points, 1 + halved, axis=0)
+    reconstruction = to_reconstruction(
+        replace(model, points=points, offsets=offsets), made.keypoints, NAMES
+    )
+    assert reconstruction.num_points3D() == len(points) > len(made.points) + 50
+    complete_tracks(reconstruction, graph_of(made), max_error_px, 1.0, 0, [])
+    left = (reconstruction.num_points3D() - len(made.points)) / halved.sum()
+    assert left < 0.05 if merged else left > 0.95
 
 
 def test_an_image_observes_a_point_once():

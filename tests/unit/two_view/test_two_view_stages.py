@@ -196,6 +196,40 @@ def test_unchanged_pairs_are_taken_over(
     assert len(calls) == 2
 
 
+def newer() -> EstimateTwoViewOptions:
+    """The options of a version to come."""
+    return type("Newer", (EstimateTwoViewOptions,), {"stage_version": 999})()
+
+
+@pytest.mark.parametrize("change", [{"options": newer()}, {"seed": 6}])
+def test_another_version_or_seed_takes_nothing_over(
+    two_views: Views, tmp_path: Path, change: dict[str, Any]
+) -> None:
+    inputs = write_inputs(tmp_path, two_views(seed=3, count=60, outliers=0), "given")
+    estimate_two_view.run(pose_job(tmp_path, inputs))
+    former, output = tmp_path / "0-0.h5", tmp_path / "again.h5"
+    estimate_two_view.run(pose_job(tmp_path, inputs, former=former, outputs=(output,), **change))
+    digests = [set(TwoViewGeometries.read(path).digests) for path in (former, output)]
+    assert len(digests[0]) == len(digests[1]) == 2 and digests[0].isdisjoint(digests[1])
+
+
+def test_pairs_of_images_with_other_keypoints_are_estimated_again(two_views: Views, tmp_path: Path) -> None:
+    views = two_views(seed=3, count=60, outliers=0)
+    inputs = write_inputs(tmp_path, views, "given")
+    estimate_two_view.run(pose_job(tmp_path, inputs))
+    features = LocalFeatures.read(tmp_path / "features.h5")
+    moved = features.keypoints.copy()
+    moved[features.offsets[1] + views.matches[0, 1]] += 5.0
+    digests = np.array(["da", "another", "dc"], dtype=object)
+    replace(features, keypoints=moved, digests=digests).write(tmp_path / "features.h5", HEADER)
+    former, output = tmp_path / "0-0.h5", tmp_path / "again.h5"
+    estimate_two_view.run(pose_job(tmp_path, inputs, former=former, outputs=(output,)))
+    before, after = (TwoViewGeometries.read(path) for path in (former, output))
+    assert (before.digests == after.digests).tolist() == [False, True]
+    assert not np.array_equal(before.rotations[0], after.rotations[0])
+    assert before.inlier_counts[0] == 60 and after.inlier_counts[0] == 59
+
+
 def test_damaged_former_is_ignored(two_views: Views, tmp_path: Path) -> None:
     inputs = write_inputs(tmp_path, two_views(seed=4), "given")
     (tmp_path / "former.h5").write_bytes(b"no artifact")
