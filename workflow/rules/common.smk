@@ -16,6 +16,7 @@ from snakesfm.job_server import JobServer
 from snakesfm.plan import Plan
 from snakesfm.records import check_folder, makes_nothing
 from snakesfm.run import Run
+from snakesfm.termination import answer_term_aside
 
 
 def refusal(error):
@@ -253,6 +254,7 @@ def all_hloc_files():
 
 def start_run():
     """Lock the output folder for this run, and say what is about to be done."""
+    answer_term_aside(workflow.scheduler)
     executor = getattr(workflow.scheduler, "_executor", None)
     # the SLURM executor names all jobs of a run alike
     slurm_run = getattr(executor, "run_uuid", "")
