@@ -52,8 +52,53 @@ def test_a_controller_that_gets_term_while_it_deals_with_ended_jobs_ends(
     assert ended.returncode == 1, ended.stdout
     assert "rule match_pairs" in ended.stdout and "rule adjust_bundle" not in ended.stdout
     lines = [line for line in ended.stdout.splitlines() if line.startswith("snakesfm: scene")]
-    assert lines
+    # all results of the former options are still there
+    assert lines[-1] == "snakesfm: scene 'square' is not finished: start the same command again."
     again = workflow.run(*config_of(small_scene))
     assert again.status == 0, again.text
     assert "16 of 16 images registered" in again.summary[-1]
     assert model_bytes(workflow.folder / "out" / "square") == model_bytes(finished[0])
+
+
+@pytest.mark.parametrize(
+    ("target", "option", "rules"),
+    [
+        (["--until", "match_pairs"], "match_pairs={max_ratio: 0.75}", {"match_pairs"}),
+        # no file that the model is made from is newer than it
+        (["databases"], "adjust_bundle={max_iterations: 77}", {"export_database", "databases"}),
+    ],
+)
+def test_a_model_of_former_options_is_not_called_this_run_s(
+    finished, small_scene: Path, workflow: Workflow, target: list[str], option: str, rules: set[str]
+) -> None:
+    copy_run(finished[0], workflow.folder)
+    outcome = workflow.run(*target, *config_of(small_scene, option))
+    assert outcome.status == 0, outcome.text
+    assert set(outcome.rules) == rules
+    *_, line = outcome.summary
+    assert "the model is older than its images or options: 'all' updates it" in line
+    assert "registered" not in line
+    assert ("COLMAP database in out/square/export_database/database.db" in line) == (
+        target == ["databases"]
+    )
+
+
+def test_a_model_of_these_options_is_named_beside_the_database(
+    finished, small_scene: Path, workflow: Workflow
+) -> None:
+    copy_run(finished[0], workflow.folder)
+    outcome = workflow.run("databases", *config_of(small_scene))
+    assert outcome.status == 0, outcome.text
+    *_, line = outcome.summary
+    assert "16 of 16 images registered" in line and "relative-pose AUC" in line
+    assert line.endswith(
+        "model in out/square/export_model/sparse/0, "
+        "COLMAP database in out/square/export_database/database.db"
+    )
+    # the database was not asked for, so nobody has looked whether it is of these options
+    other = workflow.run("--until", "export_model", *config_of(small_scene, "build_tracks={min_length: 4}"))
+    assert other.status == 0, other.text
+    *_, line = other.summary
+    assert "images registered" in line
+    # metrics are of the former model
+    assert "database" not in line and "relative-pose AUC" not in line

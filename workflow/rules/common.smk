@@ -252,6 +252,15 @@ def all_hloc_files():
     return [path for scene in PLAN.scenes.values() for path in scene.hloc_files()]
 
 
+def rules_by_scene(jobs):
+    """Per scene the names of the rules of these jobs."""
+    found = {}
+    for job in jobs:
+        if "scene" in job.wildcards.keys():
+            found.setdefault(job.wildcards.scene, set()).add(job.rule.name)
+    return found
+
+
 def start_run():
     """Lock the output folder for this run, and say what is about to be done."""
     answer_term_aside(workflow.scheduler)
@@ -271,10 +280,11 @@ def start_run():
 def finish_run(log):
     """One line per scene about its model."""
     JOB_SERVER.stop()
-    RUN.finish()
+    RUN.finish(rules_by_scene(workflow.dag.jobs))
 
 
 def fail_run(log):
     """One line per scene that ended well, and one per error."""
     JOB_SERVER.stop()
-    RUN.fail()
+    unfinished = rules_by_scene(workflow.dag.needrun_jobs()).keys()
+    RUN.fail(rules_by_scene(workflow.dag.jobs), unfinished)
