@@ -1,5 +1,6 @@
 """What a run says of its results in the end, where it was ended before or was to make others."""
 
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -102,3 +103,27 @@ def test_a_model_of_these_options_is_named_beside_the_database(
     assert "images registered" in line
     # metrics are of the former model
     assert "database" not in line and "relative-pose AUC" not in line
+
+
+def test_rule_select_pairs_is_known_by_its_name_where_scenes_differ_in_blocks(
+    small_scene: Path, workflow: Workflow
+) -> None:
+    images = sorted((small_scene / "images").iterdir())
+    for scene, count in (("few", 16), ("many", 70), ("others", 10)):
+        (workflow.folder / scene).mkdir()
+        for number in range(count):
+            (workflow.folder / scene / f"{number:02d}.jpg").symlink_to(images[number % 16])
+    scenes = ", ".join(f"{name}: {{images: {name}}}" for name in ("few", "many", "others"))
+    arguments = ["--dry-run", "--config", f"scenes={{{scenes}}}", "output=out"]
+    resources = ["--set-resources", "select_pairs:mem_mb=1234", "--set-threads", "select_pairs=1"]
+    outcome = workflow.run(*arguments, *resources)
+    assert outcome.status == 0, outcome.text
+    assert outcome.rules.count("select_pairs") == 2
+    assert outcome.rules.count("select_pairs_4_blocks") == 1
+    assert len(re.findall(r"^ +resources: .*mem_mb=1234", outcome.text, re.M)) == 3
+    some = workflow.run(*arguments, "--until", "select_pairs")
+    assert some.status != 0 and "'select_pairs select_pairs_4_blocks'" in some.text
+    assert "Traceback" not in some.text
+    until = workflow.run(*arguments, "--until", "select_pairs", "select_pairs_4_blocks")
+    assert until.status == 0, until.text
+    assert until.rules.count("select_pairs") == 2 and "match_pairs" not in until.rules

@@ -15,6 +15,7 @@ from snakesfm.config.configuration import check_spelling
 from snakesfm.job_server import JobServer
 from snakesfm.plan import Plan
 from snakesfm.records import check_folder, makes_nothing
+from snakesfm.rule_settings import check_named_together, share_resources
 from snakesfm.run import Run
 from snakesfm.termination import answer_term_aside
 
@@ -33,6 +34,8 @@ try:
         check_folder(workflow.main_snakefile)
     check_spelling(config, sys.argv[1:])
     PLAN = Plan(config, weights_only="fetch_weights" in asked)
+    if workflow.is_main_process:
+        check_named_together(sys.argv[1:], "select_pairs", PLAN.select_pairs_twins())
     RUN = Run(PLAN)
     if workflow.is_main_process and not makes_nothing(sys.argv[1:]):
         RUN.refuse_unrecorded(asked)
