@@ -60,6 +60,22 @@ def _is_recorded(output: str, records: Path) -> bool:
         return False
 
 
+def was_made_with(output: str, params: str, records: Path = RECORDS) -> bool:
+    """Whether a file was made with these params of its job, as far as there is a record of it.
+
+    Parameters
+    ----------
+    output : a file as the rules name it.
+    params : the one param that Snakemake compares.
+    records : Snakemake's folder of records.
+    """
+    try:
+        noted = json.loads((records / _record_name(output)).read_text("utf-8"))["params"]
+    except (OSError, ValueError, KeyError, TypeError):
+        return True
+    return repr(params) in noted
+
+
 def check_folder(snakefile: str, records: Path = RECORDS) -> None:
     """Make sure that Snakemake can keep its records, without which it ends in a traceback.
 

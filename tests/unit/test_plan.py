@@ -12,6 +12,7 @@ from snakesfm.config.configuration import STAGES, options_class
 from snakesfm.digests import file_digest, settings_text
 from snakesfm.errors import ConfigError
 from snakesfm.plan import Plan
+from snakesfm.rule_settings import check_named_together
 from snakesfm.seeding import derive_seed
 
 
@@ -107,8 +108,38 @@ def test_scenes_of_other_sizes_have_rules_of_their_own(tmp_path: Path) -> None:
     scenes = {name: {"images": str(tmp_path / name)} for name in "ab"}
     plan = plan_of(tmp_path, scenes=scenes)
     assert plan.scenes_by_blocks() == {2: ["a"], 4: ["b"]}
-    assert plan.select_pairs_rule(2) == "select_pairs_2_blocks"
-    assert plan_of(tmp_path, scenes={"a": scenes["a"]}).select_pairs_rule(2) == "select_pairs"
+    assert [plan.select_pairs_rule(blocks) for blocks in (2, 4)] == [
+        "select_pairs_2_blocks",
+        "select_pairs",
+    ]
+    assert plan.select_pairs_twins() == {"select_pairs_2_blocks"}
+    more = plan_of(tmp_path, scenes=scenes | {"c": scenes["a"]})
+    assert [more.select_pairs_rule(blocks) for blocks in (2, 4)] == [
+        "select_pairs",
+        "select_pairs_4_blocks",
+    ]
+    one = plan_of(tmp_path, scenes={"a": scenes["a"]})
+    assert one.select_pairs_rule(2) == "select_pairs" and one.select_pairs_twins() == set()
+
+
+@pytest.mark.parametrize(
+    ("words", "is_refused"),
+    [
+        ("--until select_pairs", True),
+        ("--until=select_pairs", True),
+        ("-R match_pairs select_pairs", True),
+        ("--until select_pairs select_pairs_2_blocks", False),
+        ("--until match_pairs --set-resources select_pairs:mem_mb=10 --set-threads select_pairs=1", False),
+        ("--until select_pairs_2_blocks", False),
+    ],
+)
+def test_a_rule_is_named_with_its_twins_or_not_at_all(words: str, is_refused: bool) -> None:
+    if is_refused:
+        with pytest.raises(ConfigError, match="say 'select_pairs select_pairs_2_blocks'"):
+            check_named_together(words.split(), "select_pairs", {"select_pairs_2_blocks"})
+    else:
+        check_named_together(words.split(), "select_pairs", {"select_pairs_2_blocks"})
+    check_named_together(words.split(), "select_pairs", set())
 
 
 @pytest.mark.parametrize("output", ["{braces}", "a{b"])

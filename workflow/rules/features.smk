@@ -56,6 +56,9 @@ rule describe_images:
         job_command("describe_images")
 
 
+share_resources(workflow.resource_settings, "select_pairs", PLAN.select_pairs_twins())
+
+
 # the outputs of a rule cannot depend on the scene, so scenes with another number of blocks have their own rule
 for blocks, scenes in PLAN.scenes_by_blocks().items():
 
