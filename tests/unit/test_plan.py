@@ -166,7 +166,7 @@ def params_of(config: dict[str, str]) -> dict[str, str]:
         ("masks/001.jpg.png", {"extract_features"}),
         ("pairs.txt", {"select_pairs"}),
         ("reference/images.txt", {"evaluate_model"}),
-        ("reference/points3D.bin", {"evaluate_model"}),
+        ("reference/points3D.txt", {"evaluate_model"}),
     ],
 )
 def test_other_bytes_of_a_given_file_change_what_its_stage_is_told(
@@ -176,12 +176,10 @@ def test_other_bytes_of_a_given_file_change_what_its_stage_is_told(
     config = {"images": str(tmp_path / "scene"), "output": str(tmp_path / "out")}
     names = ("cameras/cameras.txt", "masks", "pairs.txt", "reference")
     config |= {Path(name).parts[0].split(".")[0]: str(tmp_path / name) for name in names}
-    for name in ("cameras/cameras.txt", "cameras/images.txt", "masks/001.jpg.png", "pairs.txt"):
+    model = [f"reference/{part}.txt" for part in ("cameras", "images", "points3D")]
+    for name in ("cameras/cameras.txt", "cameras/images.txt", "masks/001.jpg.png", "pairs.txt", *model):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_text("bytes")
-    make_images(tmp_path / "reference", 0)
-    for name in ("images.txt", "points3D.bin"):
-        (tmp_path / "reference" / name).write_text("bytes")
     before = params_of(config)
     (tmp_path / changed).write_text("setyb")
     after = params_of(config)
