@@ -179,9 +179,10 @@ def test_other_bytes_of_a_given_file_change_what_its_stage_is_told(
     model = [f"reference/{part}.txt" for part in ("cameras", "images", "points3D")]
     for name in ("cameras/cameras.txt", "cameras/images.txt", "masks/001.jpg.png", "pairs.txt", *model):
         (tmp_path / name).parent.mkdir(exist_ok=True)
-        (tmp_path / name).write_text("bytes")
+        # runs refuse known cameras that are none
+        (tmp_path / name).write_text("1 PINHOLE 640 480 500 500 320 240\n")
     before = params_of(config)
-    (tmp_path / changed).write_text("setyb")
+    (tmp_path / changed).write_text("1 PINHOLE 640 480 600 600 320 240\n")
     after = params_of(config)
     assert {stage for stage in STAGES if before[stage] != after[stage]} == stages
 
