@@ -34,6 +34,8 @@ from snakesfm.geometry.colmap_binding import pycolmap
 EARLY_TOLERANCE = 300.0
 # of the longest plausible focal length: the rays of such a lens are all but parallel
 LONG_LENS_SHARE = 0.5
+# of the mean reprojection error, what another round leaves where principal points have arrived
+SETTLED_SHARE = 0.9
 # early rounds come before all observations are there, final ones after, the last of which is exact
 Phase = Literal["early", "final", "last"]
 
@@ -255,9 +257,10 @@ class _Mapper:
         return adjust_selection(self.reconstruction, self.adjust, solving, per_image, settings.seed)
 
     def refine_principal_points(self, sources: Sequence[ImageSource]) -> None:
-        """One more round in which the principal points that the model tells are free, or two.
+        """One more round in which the principal points that the model tells are free.
 
-        Where one moved far, observations that the former model had bent or lost come back in the second.
+        Where one moves far, more follow until the errors hardly fall: coarse passes end on the way, and
+        observations come back that the model before had bent or lost.
         """
         settings = self.settings
         solving = replace(self.solving, loss_scale_px=self.loss_scale_px())
@@ -275,9 +278,11 @@ class _Mapper:
         held = frozenset(self.reconstruction.cameras).difference(found.told)
         self.solving = replace(before, constant_cameras=held, refine_principal_points=True)
         self.round("principal points", settings.thresholds_px[-1], "final")
-        if found.moves_far:
+        settled = not found.moves_far
+        while not settled:
             self.prepare(settings.complete_tracks, sources)
             self.round("principal points again", settings.thresholds_px[-1], "final")
+            settled = self.records[-1].error_px > SETTLED_SHARE * self.records[-2].error_px
         self.solving = before
 
     def drop_outliers(self) -> None:

@@ -7,6 +7,7 @@ import pytest
 from synthetic_scene import HEADER, write_features, write_geometries, write_scene
 
 from snakesfm.artifacts import (
+    CalibratedCameras,
     CameraCenters,
     CameraRotations,
     Reconstruction,
@@ -264,3 +265,24 @@ def test_matches_of_refused_pairs_bring_observations_where_the_model_agrees(made
     more, without, ambiguous = found.values()
     assert 1.1 < more.sum() / without.sum() < 2
     np.testing.assert_array_equal(ambiguous, without)
+
+
+def test_a_principal_point_that_seems_too_far_off_is_told_of(made, inputs, tmp_path):
+    (camera,) = made.cameras
+    # beyond what is believed, however much the errors fall
+    shifted = replace(camera, params=(*camera.params[:2], 80.0, *camera.params[3:]))
+    models, sizes, params, sources = cameras_to_columns([shifted])
+    CalibratedCameras(models, sizes, params, sources, np.full(1, np.nan), np.zeros(1, int)).write(
+        inputs["cameras"], HEADER
+    )
+    run_all(inputs, tmp_path)
+    run(
+        adjust_bundle,
+        AdjustBundleOptions(refine_keypoints=False),
+        inputs,
+        tmp_path / "model.h5",
+        intrinsics="refine",
+    )
+    model = Reconstruction.read(tmp_path / "model.h5")
+    assert model.camera_params[0, 2] == 80.0
+    assert 0.35 < model.camera_offsets[0] < 0.4
