@@ -295,6 +295,8 @@ def test_images_are_described_by_networks_with_random_weights(
     blocks = [GlobalDescriptors.read(path) for path in sorted((out / "describe_images").glob("*.h5"))]
     assert sum(len(block.image_ids) for block in blocks) == 16
     for block in blocks:
-        np.testing.assert_allclose(np.linalg.norm(block.descriptors, axis=1), 1, atol=1e-5)
+        # up to rounding to multiples of 1/2048
+        longest = np.sqrt(block.descriptors.shape[1]) / 4096
+        np.testing.assert_allclose(np.linalg.norm(block.descriptors, axis=1), 1, atol=longest)
     tiles = [ImagePairs.read(path) for path in sorted((out / "select_pairs").glob("*.h5"))]
     assert 16 <= sum(len(tile.pairs) for tile in tiles) <= 32
