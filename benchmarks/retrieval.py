@@ -23,7 +23,7 @@ from benchmarks.on_sets import Run, SetTable, Value, finished
 from snakesfm.artifacts import GlobalDescriptors, ImageIndex
 from snakesfm.config.select_pairs import SelectPairsOptions
 from snakesfm.evaluation.colmap_model import read_model
-from snakesfm.retrieval.pairs import natural_key
+from snakesfm.retrieval.pairs import natural_key, similarities_of
 from snakesfm.retrieval.preview import look_at_pairs
 from snakesfm.stages.select_pairs import read_previews
 
@@ -65,7 +65,8 @@ def overlapping_pairs(image_set: ImageSet, names: Sequence[str]) -> Array:
 def rank_pairs(similarities: Array) -> Array:
     """Pairs (P,2), best first: by the better of the ranks that two images have for each other.
 
-    Ties go to the more similar. Images choose in turn, as they do in select_pairs.
+    Ties go to the more similar. Images choose in turn, as they do in select_pairs, and pairs of a
+    similarity of -inf are left out, as there.
 
     Parameters
     ----------
@@ -78,7 +79,7 @@ def rank_pairs(similarities: Array) -> Array:
     first, second = np.triu_indices(len(values), 1)
     best = np.minimum(ranks[first, second], ranks[second, first])
     chosen = np.lexsort((-values[first, second], best))
-    return np.column_stack([first, second])[chosen]
+    return np.column_stack([first, second])[chosen[np.isfinite(values[first, second][chosen])]]
 
 
 def recalls(pairs: Array, overlapping: Array) -> list[float]:
@@ -132,13 +133,13 @@ def _likenesses(scene: Path, count: int) -> Array:
 
 
 def _similarities(scene: Path, count: int) -> Array:
-    """Similarities (N,N) of the images' global descriptors."""
+    """Similarities (N,N) of the images' global descriptors, as select_pairs has them."""
     described: dict[int, Array] = {}
     for path in sorted((scene / "describe_images").glob("*.h5")):
         block = GlobalDescriptors.read(path)
         described |= dict(zip(block.image_ids.tolist(), block.descriptors, strict=True))
     vectors = np.stack([described[row] for row in range(count)])
-    return vectors @ vectors.T
+    return similarities_of(vectors, vectors)
 
 
 def render(values: Mapping[str, Value], sets: Sequence[str], choices: Sequence[str]) -> str:

@@ -17,6 +17,7 @@ from snakesfm.bundle.interface import SolverSettings
 from snakesfm.bundle.model import BundleModel, from_reconstruction, to_reconstruction
 from snakesfm.bundle.round_settings import RoundSettings
 from snakesfm.bundle.rounds import adjust_rounds
+from snakesfm.config.adjust_bundle import AdjustBundleOptions
 from snakesfm.geometry.camera import cameras_to_columns
 from snakesfm.view_graph.components import label_components
 
@@ -47,7 +48,14 @@ def write_scene(made, folder):
         warnings=[],
     ).write(folder / "index.h5", HEADER)
     CalibratedCameras(
-        models, sizes, params, sources, np.full(len(models), np.nan), np.zeros(len(models), int)
+        models,
+        sizes,
+        params,
+        sources,
+        np.full(len(models), np.nan),
+        np.zeros(len(models), int),
+        np.zeros((0, 4), int),
+        [],
     ).write(folder / "cameras.h5", HEADER)
     ViewGraph(
         pairs=made.pairs,
@@ -90,6 +98,13 @@ def graph_of(made, matches=None):
     return correspondence_graph(counts, made.pairs, made.match_offsets, matches)
 
 
+def round_settings(**changes):
+    """The options' defaults with changes."""
+    names = set(RoundSettings.__dataclass_fields__)
+    extra = {"widen_lenses": False, "patient": False, "seed": 0}
+    return RoundSettings(**AdjustBundleOptions().model_dump(include=names) | extra | changes)
+
+
 def run_rounds(made, model, solving=None, **changes):
     """The adjusted model, and the records of its rounds, with changed settings."""
     reconstruction = to_reconstruction(model, made.keypoints, [f"{k}.jpg" for k in range(made.image_count)])
@@ -99,7 +114,7 @@ def run_rounds(made, model, solving=None, **changes):
         lambda: graph_of(made),
         model.cameras,
         solving or SolverSettings(),
-        RoundSettings(**changes),
+        round_settings(**changes),
         records.append,
     )
     return from_reconstruction(reconstruction, model)[0], records

@@ -1,4 +1,4 @@
-"""How many blocks the images are dealt into, which is whose, and the tiles of pairs that these make."""
+"""Assignment of images to blocks, and the tiles of pairs between blocks."""
 
 import hashlib
 from collections.abc import Sequence

@@ -1,4 +1,4 @@
-"""Digests by which a file is known to be of a configuration, and inputs to be what they were."""
+"""Digests that identify the configuration of a file, and unchanged inputs."""
 
 import functools
 import hashlib

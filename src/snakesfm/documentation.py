@@ -179,8 +179,9 @@ def render_artifacts_page() -> str:
         "",
         "Every stage writes HDF5 files at `OUTPUT/SCENE/STAGE/FILE.h5`, one per job; a file is complete or absent. "
         "The root attributes are `artifact` (the kind below), `format_version`, `stage`, `stage_version`, `scene`, "
-        "`options` and `settings` (canonical JSON; `settings` holds the seed and other inputs that are not options) "
-        "and `software`; there are no timestamps, so equal runs give equal bytes. Readers refuse other kinds and "
+        "`options`, `settings` (canonical JSON; `settings` holds the seed and other inputs that are not options), "
+        "`software`, and `checksum` (CRC-32 of all datasets in the order of the table below; readers refuse a file "
+        "with another one); there are no timestamps, so equal runs give equal bytes. Readers refuse other kinds and "
         "versions.",
         "",
         "Letters in shapes are lengths: the same letter is the same length within one file, and `P+1` is one more "

@@ -1,4 +1,4 @@
-"""The errors that a user can cause and mend.
+"""The errors that a user can cause and fix.
 
 SnakesfmError            anything that ends a job with one clear sentence
 ├── ConfigError          an option, a key of config.yaml or a path named there

@@ -1,4 +1,4 @@
-"""Which names of two lists of images mean the same image."""
+"""Matching of image names between two lists."""
 
 from collections import Counter
 from collections.abc import Sequence

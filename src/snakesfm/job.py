@@ -131,7 +131,6 @@ def _bind(call: Call, terminal: Any) -> Any:
         seed=params["seed"],
         threads=call.threads,
         former=former if former.is_file() else None,
-        upstream=call.files["upstream"],
         batch_size=call.files["batch_size"],
     )
 

@@ -1,4 +1,4 @@
-"""The list of pairs that a scene is given: a text file, or the matches of hloc themselves.
+"""The list of pairs given for a scene: a text file, or hloc's matches.
 
 The Snakefile asks this while it is parsed, so what reads HDF5 is loaded only where there is such a file.
 """

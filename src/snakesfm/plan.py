@@ -1,4 +1,4 @@
-"""What the Snakefile asks of the configuration: which scenes there are, and which weights they need."""
+"""The plan of a run for the Snakefile: its scenes, and the weights they need."""
 
 import os
 from collections.abc import Mapping
@@ -61,5 +61,11 @@ class Plan:
         return groups
 
     def select_pairs_rule(self, blocks: int) -> str:
-        """The name of rule select_pairs for a number of blocks; plain where one serves all scenes."""
-        return "select_pairs" if len(self.scenes_by_blocks()) == 1 else f"select_pairs_{blocks}_blocks"
+        """The name of rule select_pairs for a number of blocks; plain for the one that most scenes have."""
+        groups = self.scenes_by_blocks()
+        usual = max(groups, key=lambda count: (len(groups[count]), count))
+        return "select_pairs" if blocks == usual else f"select_pairs_{blocks}_blocks"
+
+    def select_pairs_twins(self) -> set[str]:
+        """The names of rule select_pairs for the scenes that do not have the usual number of blocks."""
+        return {self.select_pairs_rule(blocks) for blocks in self.scenes_by_blocks()} - {"select_pairs"}

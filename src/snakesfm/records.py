@@ -1,4 +1,4 @@
-"""What Snakemake noted of the files that it made."""
+"""Snakemake's records of the files that it made."""
 
 import json
 import os
@@ -58,6 +58,22 @@ def _is_recorded(output: str, records: Path) -> bool:
         return abs(float(record["endtime"]) - changed) < SAME_TIME_S
     except (OSError, ValueError, KeyError, TypeError):
         return False
+
+
+def was_made_with(output: str, params: str, records: Path = RECORDS) -> bool:
+    """Whether a file was made with these params of its job, as far as there is a record of it.
+
+    Parameters
+    ----------
+    output : a file as the rules name it.
+    params : the one param that Snakemake compares.
+    records : Snakemake's folder of records.
+    """
+    try:
+        noted = json.loads((records / _record_name(output)).read_text("utf-8"))["params"]
+    except (OSError, ValueError, KeyError, TypeError):
+        return True
+    return repr(params) in noted
 
 
 def check_folder(snakefile: str, records: Path = RECORDS) -> None:

@@ -1,4 +1,4 @@
-"""What a job needs, as a cluster's scheduler wants to know it before the job starts: memory and time.
+"""Memory and time that a job requests from a cluster's scheduler.
 
 Needs are straight lines above measured jobs (docs/cluster.md), in what a job works on, its images and
 pairs; those of select_pairs are the pairs that it looks at. They never reach a stage, so they cannot change

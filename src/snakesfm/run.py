@@ -1,4 +1,4 @@
-"""The start and the end of a run, as a person sees them."""
+"""The start and the end of a run, with the messages to the user."""
 
 import contextlib
 import fcntl
@@ -8,7 +8,7 @@ import re
 import subprocess
 import threading
 import time
-from collections.abc import Set
+from collections.abc import Mapping, Set
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,7 @@ from snakesfm import slurm
 from snakesfm.errors import ConfigError
 from snakesfm.job_logs import find_cost
 from snakesfm.plan import Plan
-from snakesfm.records import MAKES_PART, forget, unrecorded_files
+from snakesfm.records import MAKES_PART, forget, unrecorded_files, was_made_with
 from snakesfm.scene_plan import ScenePlan
 
 LOCK_NAME = ".snakesfm.lock"
@@ -31,6 +31,7 @@ class Run:
         self.started = time.time()
         self.lock: Any = None
         self.slurm_run = ""
+        self.planned: Mapping[str, Set[str]] = {}
 
     def refuse_unrecorded(self, asked: Set[str]) -> None:
         """Set aside what other images, options or seeds made and Snakemake knows nothing of.
@@ -165,10 +166,17 @@ class Run:
                 flush=True,
             )
 
-    def finish(self) -> None:
-        """One line per scene about its model."""
+    def finish(self, planned: Mapping[str, Set[str]]) -> None:
+        """One line per scene about its model.
+
+        Parameters
+        ----------
+        planned : per scene the rules of the jobs that are done or needed not be: results of other rules may
+            be of former images or options.
+        """
         if self.plan.weights_only:
             return
+        self.planned = planned
         _cancel_timers()
         self._note("")
         for scene in self.plan.scenes.values():
@@ -176,10 +184,17 @@ class Run:
             for warning in self._summary(scene).get("warnings", ()):
                 print(f"snakesfm: scene '{scene.name}': warning: {warning}", flush=True)
 
-    def fail(self) -> None:
-        """One line per scene: its model where it has one, else the sentences of its failed jobs."""
+    def fail(self, planned: Mapping[str, Set[str]], unfinished: Set[str]) -> None:
+        """One line per scene: its model where its jobs are done, else the sentences of its failed jobs.
+
+        Parameters
+        ----------
+        planned : per scene the rules of its jobs, done or not.
+        unfinished : the scenes with jobs that are not done.
+        """
         if self.plan.weights_only:
             return
+        self.planned = planned
         _cancel_timers()
         with contextlib.suppress(OSError, subprocess.SubprocessError):
             if not self.slurm_run or not slurm.list_jobs(self.slurm_run):
@@ -192,13 +207,13 @@ class Run:
                 if len(sentences) > MOST_SENTENCES:
                     more = len(sentences) - MOST_SENTENCES
                     print(f"snakesfm: scene '{scene.name}' failed: {more} more jobs.", flush=True)
-            elif all(Path(file).is_file() for file in scene.final_files()):
-                print(self.describe(scene), flush=True)
-            else:
+            elif scene.name in unfinished:
                 print(
                     f"snakesfm: scene '{scene.name}' is not finished: start the same command again.",
                     flush=True,
                 )
+            else:
+                print(self.describe(scene), flush=True)
 
     def failures(self, scene: ScenePlan) -> list[str]:
         """The sentences of the scene's jobs that failed in this run, with their logs."""
@@ -218,46 +233,61 @@ class Run:
 
     def _summary(self, scene: ScenePlan) -> dict[str, Any]:
         """What export_model says of the scene's model; empty where there is none of the present images."""
-        if self._is_outdated(scene):
+        return self._read_result(scene, "export_model", "summary.json")
+
+    def _read_result(self, scene: ScenePlan, stage: str, name: str) -> dict[str, Any]:
+        """A result in JSON; empty where it is missing or of former images or options."""
+        file = scene.folder / stage / name
+        if self._is_outdated(scene, stage, file):
             return {}
         try:
-            summary: dict[str, Any] = json.loads(
-                (scene.folder / "export_model" / "summary.json").read_text("utf-8")
-            )
+            result: dict[str, Any] = json.loads(file.read_text("utf-8"))
         except (OSError, ValueError):
             return {}
-        return summary
+        return result
 
-    def _is_outdated(self, scene: ScenePlan) -> bool:
-        """Whether the images were indexed anew since the model was made, as without the target 'all'."""
-        with contextlib.suppress(OSError):
-            index, summary = (
-                (scene.folder / name).stat().st_mtime_ns
-                for name in ("index_images/index.h5", "export_model/summary.json")
-            )
-            return summary < index
-        return False
+    def _is_outdated(self, scene: ScenePlan, stage: str, result: Path) -> bool:
+        """Whether a result is of former images or options, as where another target was asked for."""
+        if stage in self.planned.get(scene.name, ()):
+            return False
+        try:
+            made = result.stat().st_mtime_ns
+        except OSError:
+            return False
+        # files of one stage that are all older than the result were made with the same options
+        one_of = {stage: result}
+        for file in map(Path, scene.artifacts()):
+            with contextlib.suppress(OSError):
+                if file.stat().st_mtime_ns > made:
+                    return True
+                one_of[file.parent.name] = file
+        return not all(
+            was_made_with(str(file), scene.params(name, {"block": file.stem, "tile": file.stem}, True))
+            for name, file in one_of.items()
+        )
 
     def describe(self, scene: ScenePlan) -> str:
-        """How many images are registered, the points, the error, the time, and where the model is."""
+        """How many images are registered, the points, the error, the time, and where the results are."""
+        database = Path(scene.database_file())
+        made = "export_database" in self.planned.get(scene.name, ()) and database.is_file()
+        in_database = f"COLMAP database in {database}" if made else ""
         summary = self._summary(scene)
         if not summary:
-            database = Path(scene.database_file())
-            made = f"COLMAP database in {database}, " if database.is_file() else ""
-            former = self._is_outdated(scene)
-            model = "the model is older than its images: 'all' updates it" if former else "no model yet"
-            return f"snakesfm: scene '{scene.name}': {made}{model}."
+            is_former = (scene.folder / "export_model" / "summary.json").is_file()
+            older = "the model is older than its images or options: 'all' updates it"
+            model = older if is_former else "no model yet"
+            return f"snakesfm: scene '{scene.name}': {', '.join(filter(None, (in_database, model)))}."
         others = summary.get("images_in_other_models", [])
         more = f" and {sum(others)} in {len(others)} other models" if others else ""
         accuracy = ""
-        with contextlib.suppress(OSError, ValueError, KeyError):
-            metrics = json.loads((scene.folder / "evaluate_model" / "metrics.json").read_text("utf-8"))
-            accuracy = _describe_accuracy(metrics)
+        with contextlib.suppress(KeyError):
+            accuracy = _describe_accuracy(self._read_result(scene, "evaluate_model", "metrics.json"))
         return (
             f"snakesfm: scene '{scene.name}': {summary['registered_images']} of {summary['images']} images "
             f"registered{more}, {summary['points']} points, mean reprojection error "
             f"{summary['mean_reprojection_error_px']:.3f} px{accuracy}, "
             f"{time.time() - self.started:.0f} s; model in {scene.folder / 'export_model' / 'sparse' / '0'}"
+            f"{', ' + in_database if in_database else ''}"
         )
 
 

@@ -1,4 +1,4 @@
-"""A pipe that a run on one machine holds open, by which the system ends its jobs when it is gone.
+"""A pipe that a run on one machine keeps open, so that its jobs end when the run ends.
 
 A job that outlives its run would write over what the next run makes. Imports little, as every job waits
 for it.

@@ -2,8 +2,16 @@
 
 from pathlib import Path
 
-from snakesfm.config.configuration import STAGES
+from snakesfm.config.configuration import STAGES, options_class
 from snakesfm.errors import ConfigError
+from snakesfm.given_files import (
+    NO_CAMERAS,
+    NO_CAMERAS_FILE,
+    NO_MODEL,
+    find_cameras_file,
+    find_model_folder,
+    looks_like_cameras,
+)
 from snakesfm.ingest.discover import count_images, list_photographs, walk_images
 from snakesfm.ingest.masks import find_mask
 from snakesfm.scene_plan import ScenePlan
@@ -17,7 +25,9 @@ def check_scene(scene: ScenePlan) -> None:
     ConfigError : names the path and the remedy.
     """
     _check_images(scene)
+    _check_keys_together(scene)
     _check_given_files(scene)
+    _check_cameras(scene)
     if scene.inputs.masks:
         _check_masks(scene)
     models = [model for stage in STAGES for model in scene.models(stage)]
@@ -57,7 +67,33 @@ def _check_images(scene: ScenePlan) -> None:
         raise ConfigError(f"The folder '{images}' contains no JPEG, PNG, TIFF, WebP or BMP image: {remedy}")
 
 
-def _check_given_files(scene: ScenePlan) -> None:
+def _check_keys_together(scene: ScenePlan) -> None:
+    """Refuse keys that would do nothing beside the others, or lack one that they need."""
+    inputs, front_end = scene.inputs, scene.configuration.front_end
+    for stage in ("extract_features", "match_pairs") if front_end else ():
+        chosen, implied = getattr(scene.configuration, stage).method, scene.method(stage)
+        # config.yaml sets every option, so the default says nothing of what the user wants
+        if chosen not in (implied, options_class(stage).model_fields["method"].default):
+            raise ConfigError(
+                f"front_end={front_end} means {stage}.method '{implied}', but the configuration sets "
+                f"'{chosen}': remove front_end and set both extract_features.method and "
+                f"match_pairs.method, or remove {stage}.method."
+            )
+    if inputs.imported and scene.method("extract_features") != "imported":
+        raise ConfigError(
+            f"Scene '{scene.name}' has imported={inputs.imported}, which is only read by the front-end "
+            "'imported': set front_end=imported or remove imported=."
+        )
+    if inputs.pairs and scene.select_pairs.method != "listed":
+        raise ConfigError(
+            f"Scene '{scene.name}' has pairs={inputs.pairs}, but select_pairs.method "
+            f"'{scene.select_pairs.method}' does not read it: set this to 'listed' or remove pairs=."
+        )
+    if inputs.intrinsics == "refine" and not inputs.cameras:
+        raise ConfigError(
+            f"Scene '{scene.name}' has intrinsics=refine, but no known intrinsics to refine (others are "
+            "refined anyway): set cameras=PATH or remove intrinsics=."
+        )
     if scene.configuration.select_pairs.method == "listed" and not scene.pairs_file:
         raise ConfigError(
             f"select_pairs.method is 'listed', but scene '{scene.name}' has no list of pairs: "
@@ -75,6 +111,9 @@ def _check_given_files(scene: ScenePlan) -> None:
             f"The front-end 'imported' reads hloc's files, but scene '{scene.name}' names none: "
             "set imported=DIR."
         )
+
+
+def _check_given_files(scene: ScenePlan) -> None:
     for key in ("reference", "cameras", "masks", "pairs", "imported"):
         path = getattr(scene.inputs, key)
         if path and not Path(path).expanduser().exists():
@@ -92,6 +131,24 @@ def _check_given_files(scene: ScenePlan) -> None:
             f"'{scene.inputs.imported}', given as imported= for scene '{scene.name}', is not a folder: "
             "give the folder that contains hloc's features.h5 and matches.h5."
         )
+    reference = scene.inputs.reference
+    if reference and find_model_folder(Path(reference).expanduser()) is None:
+        raise ConfigError(f"'{reference}', given as reference= for scene '{scene.name}', {NO_MODEL}")
+
+
+def _check_cameras(scene: ScenePlan) -> None:
+    if not scene.inputs.cameras:
+        return
+    given = f"'{scene.inputs.cameras}', given as cameras= for scene '{scene.name}',"
+    file = find_cameras_file(Path(scene.inputs.cameras).expanduser())
+    if file is None:
+        raise ConfigError(f"{given} {NO_CAMERAS_FILE}")
+    try:
+        fits = looks_like_cameras(file)
+    except OSError as error:
+        raise ConfigError(f"{given} cannot be read ({error.strerror}): change its permissions.") from None
+    if not fits:
+        raise ConfigError(f"{given} {NO_CAMERAS}: correct the path or remove the key.")
 
 
 def _check_masks(scene: ScenePlan) -> None:

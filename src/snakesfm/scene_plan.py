@@ -1,4 +1,4 @@
-"""What the Snakefile asks of one scene: its blocks, tiles, files, and what each job is told.
+"""The plan of one scene for the Snakefile: its blocks, tiles, files, and the parameters of its jobs.
 
 Everything here is computed from the configuration and the listing of the image folder, so the graph of
 jobs is known before anything runs.
@@ -225,7 +225,7 @@ class ScenePlan:
         return self.files("describe_images", "blocks") if self.select_pairs.needs_descriptors else []
 
     def previewed_features(self) -> list[str]:
-        """The features of all blocks where pairs are looked at before they are chosen, else nothing."""
+        """The features of all blocks if pairs are previewed before they are chosen, else nothing."""
         return self.files("extract_features", "blocks") if self.select_pairs.looks_at_pairs else []
 
     @property

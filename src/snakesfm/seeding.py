@@ -1,4 +1,4 @@
-"""Seeds that depend on what is worked on, never on the order or the number of jobs."""
+"""Seeds that depend on the data worked on, never on the order or number of jobs."""
 
 import hashlib
 

@@ -225,6 +225,8 @@ class Simulation:
             np.array(sources, dtype=object),
             np.zeros(1),
             np.zeros(1, np.int32),
+            np.zeros((0, 4), np.int32),
+            np.zeros(0, dtype=object),
         ).write(self._path("calibrate_cameras", "cameras"), self._header("calibrate_cameras"))
 
     def write_geometries(self, tile: str, pairs: Array) -> None:

@@ -1,4 +1,4 @@
-"""SLURM jobs: those of an earlier run, which live on when it was killed, and those that SLURM forgot."""
+"""SLURM jobs: cancelling those left by a killed run, and handling those that SLURM has forgotten."""
 
 import subprocess
 import sys

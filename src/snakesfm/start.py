@@ -1,4 +1,4 @@
-"""What a job's script calls: a fork of the run's job server, or the job in this process.
+"""Entry point of a job's script: a fork of the run's job server, or the job in this process.
 
 Imports no more than it needs to ask the server, as this is what each job waits for.
 """

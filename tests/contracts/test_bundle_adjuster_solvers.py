@@ -3,9 +3,8 @@
 import numpy as np
 import pytest
 
-from snakesfm.bundle.interface import SolverSettings
+from snakesfm.bundle.interface import SolverSettings, bundle_adjuster
 from snakesfm.bundle.model import BundleModel, from_reconstruction, reprojection_errors, to_reconstruction
-from snakesfm.bundle.rounds import bundle_adjuster
 from snakesfm.errors import ConfigError
 from snakesfm.geometry.camera import Camera
 from snakesfm.geometry.poses import translation_of
@@ -104,6 +103,14 @@ class BundleAdjusterContract:
         result, _ = from_reconstruction(reconstruction, model)
         np.testing.assert_allclose(result.cameras[0].params, camera.params, rtol=2e-3, atol=2e-3)
         assert errors_px(result, made).mean() < 0.05
+
+    def test_held_distortion_stays(self, adjust):
+        start = Camera("SIMPLE_RADIAL", 640, 480, (510.0, 320.0, 240.0, 0.0))
+        _, model, reconstruction = scene(start=start)
+        adjust(reconstruction, SolverSettings(refine_distortion=False))
+        (camera,) = from_reconstruction(reconstruction, model)[0].cameras
+        assert abs(camera.params[3]) < 1e-4
+        assert 1.0 < abs(camera.params[0] - 510.0) < 50.0
 
     def test_held_rotations_stay(self, adjust):
         _, model, reconstruction = scene(noise_px=0.3)

@@ -26,6 +26,20 @@ def errors_of(points, made):
     return np.linalg.norm(points[found] - made.points[found], axis=1), found
 
 
+def seen_along_z(centers, points, noise_px=0.0):
+    """Points (T,3) that all cameras (N,3) see with a focal length of 1000 px, all looking along z."""
+    count, offsets = len(centers), points[:, None] - centers
+    rays = offsets[..., :2] / offsets[..., 2:] + np.asarray(noise_px) / 1000.0
+    return TriangulationProblem(
+        np.tile(np.eye(3), (count, 1, 1)),
+        -centers,
+        np.full(count, 1000.0),
+        np.arange(len(points) + 1) * count,
+        np.tile(np.arange(count), len(points)),
+        rays.reshape(-1, 2),
+    )
+
+
 class TriangulatorContract:
     """Inherit and set ``method``."""
 
@@ -60,6 +74,18 @@ class TriangulatorContract:
         assert inliers[made.track_outliers & long].mean() < 0.08
         assert np.median(errors) < 0.03
 
+    def test_many_wrong_observations_cost_no_right_ones(self, triangulate):
+        rng = np.random.default_rng(1)
+        centers = np.column_stack([np.linspace(-3, 3, 10), rng.normal(0, 0.3, 10), np.zeros(10)])
+        truth = rng.uniform([-3, -2, 8], [3, 2, 14], (300, 3))
+        noise = rng.normal(0, 0.5, (300, 10, 2))
+        wrong = rng.uniform(size=(300, 10)) < 0.3
+        noise[wrong] += rng.uniform(8, 40, (wrong.sum(), 1)) * [1.0, 0.3]
+        points, inliers = triangulate(seen_along_z(centers, truth, noise), LIMITS)
+        inliers = inliers.reshape(300, 10)
+        assert inliers[~wrong].mean() > 0.98 and inliers[wrong].mean() < 0.05
+        assert 0.004 < np.median(np.linalg.norm(points - truth, axis=1)) < 0.02
+
     def test_points_behind_a_camera_are_refused(self, triangulate):
         made = make_problem(12, 100, noise_px=0.0)
         problem = as_problem(made)
@@ -86,6 +112,20 @@ class TriangulatorContract:
         points, inliers = triangulate(narrow, replace(LIMITS, min_angle_deg=0.1))
         np.testing.assert_allclose(points[0], point, atol=1e-3)
         assert inliers.all()
+
+    @pytest.mark.parametrize(("factor", "found"), [(0.9, False), (1.1, True)])
+    def test_rays_must_meet_at_the_smallest_angle(self, triangulate, factor, found):
+        reach = 10.0 * np.tan(np.radians(factor * 2.0) / 2)
+        centers = np.array([[-reach, 0.0, 0.0], [reach, 0.0, 0.0]])
+        problem = seen_along_z(centers, np.array([[0.0, 0.0, 10.0]]))
+        points, inliers = triangulate(problem, replace(LIMITS, min_angle_deg=2.0))
+        assert np.isfinite(points).all() == found and (inliers == found).all()
+
+    def test_a_camera_that_looks_away_does_not_agree(self, triangulate):
+        centers = np.array([[-2.0, 0.0, 0.0], [2.0, 0.0, 0.0], [0.0, 1.0, 20.0]])
+        points, inliers = triangulate(seen_along_z(centers, np.array([[0.0, 0.0, 10.0]])), LIMITS)
+        np.testing.assert_allclose(points, [[0.0, 0.0, 10.0]], atol=1e-6)
+        assert inliers.tolist() == [True, True, False]
 
     def test_empty_and_single_observations(self, triangulate):
         made = as_problem(make_problem(5, 60))

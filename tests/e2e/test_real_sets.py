@@ -3,6 +3,8 @@
 import json
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 from workflow_runner import Workflow
 
@@ -63,6 +65,24 @@ def test_photographs_that_overlap_little(data: Path, workflow: Workflow) -> None
     assert metrics["reference_images_registered"] == metrics["reference_images"] == 8
     assert 50.0 < metrics["relative_pose_auc_1deg"] < 95.0
     assert 88.0 < metrics["relative_pose_auc_5deg"] < 99.0
+
+
+def test_part_of_the_vehicle_in_all_photographs(data: Path, workflow: Workflow) -> None:
+    folder, band = workflow.folder / "vehicle", slice(600, 720)
+    (folder / "images").mkdir(parents=True)
+    (folder / "reference").symlink_to(data / "strecha_entry_p10" / "reference")
+    for path in sorted((data / "strecha_entry_p10" / "images").iterdir()):
+        pixels = cv2.imread(str(path))
+        noise = np.random.default_rng(0).integers(0, 255, pixels[band].shape).astype(np.uint8)
+        pixels[band] = cv2.normalize(cv2.GaussianBlur(noise, (0, 0), 2), None, 20, 180, cv2.NORM_MINMAX)
+        cv2.imwrite(str(folder / "images" / path.name), pixels)
+    metrics = metrics_of(workflow, folder, f"cameras={folder / 'reference' / 'cameras.txt'}")
+    check(metrics, (88.0, 95.0, 97.0))
+    summary = json.loads((workflow.folder / "out/vehicle/export_model/summary.json").read_text())
+    (warning,) = summary["warnings"]
+    # 120 of 760 rows and a cell around them
+    assert 14 < float(warning.split(" %")[0]) < 19
+    assert "overlay_share" in warning
 
 
 def test_retrieval_on_a_real_sequence(data: Path, workflow: Workflow) -> None:

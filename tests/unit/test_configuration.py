@@ -54,6 +54,32 @@ from snakesfm.errors import ConfigError
         ({"adjust_bundle": {"max_iterations": 2**31}}, ["max_iterations' = 2147483648: ", "1000000"]),
         ({"average_translations": {"edge_weight": float("inf")}}, ["edge_weight' = inf: ", "1000000"]),
         ({"average_rotations": {"min_component_images": 2}}, ["_images' = 2: ", "equal to 3."]),
+        ({"export_model": {"georeference": "maybe"}}, ["= 'maybe': ", "be true or false (or 'auto')."]),
+        ({"adjust_bundle": {"rotations_first": "often"}}, ["= 'often': ", "be true or false."]),
+        ({"adjust_bundle": {"loss_scale_px": "many"}}, ["= 'many': ", "be a number (or 'auto')."]),
+        (
+            {"extract_features": None, "max_keypoints": 3},
+            ["key 'extract_features' has no value", "indented below it, such as 'max_keypoints'"],
+        ),
+        ({"extract_features": "sift"}, ["key 'extract_features' = 'sift': ", "a block of options"]),
+        ({"scenes": {"a": {"image": "x"}}}, ["key 'scenes.a.image': did you mean 'images'?"]),
+        ({"scenes": {"a": {"cameras": "x"}}}, ["key 'scenes.a.images' is missing"]),
+        ({"scenes": {"a": "x"}}, ["key 'scenes.a' = 'x': ", "a block of options"]),
+        ({"scenes": "x"}, ["key 'scenes' = 'x': ", "one block of keys per scene"]),
+        ({"adjust_bundle": {"thresholds_px": 3}}, ["_px' = 3: ", "a list such as [10.0, 5.0, 3.0]."]),
+        (
+            {"adjust_bundle": {"thresholds_px": [3, 5]}},
+            ["key 'adjust_bundle': thresholds_px must not rise"],
+        ),
+        ({"adjust_bundle": {"thresholds_px": [5, True]}}, ["= [5, true]: ", "not true or false."]),
+        ({"images": None}, ["key 'images' has no value: set one"]),
+        ({"select_pairs": {"top_k": None}}, ["key 'select_pairs.top_k' has no value: set one"]),
+        ({"select_pairs": {"top_k": True}}, ["top_k' = true: ", "a number, not true or false."]),
+        ({"adjust_bundle": {"loss_scale_px": False}}, ["_px' = false: ", "a number, not true or false."]),
+        ({"select_pairs": {"top_k": 2.5}}, ["top_k' = 2.5: ", "a whole number (or 'auto')."]),
+        ({"images": ["x"]}, ["'images' = ['x']: ", "should be text."]),
+        ({"blocks": True}, ["'blocks' = true: ", "a number, not true or false."]),
+        ({"seed": True}, ["'seed' = true: ", "a number, not true or false."]),
     ],
 )
 def test_a_wrong_key_or_value_gives_one_sentence_that_names_it(values: dict, parts: list[str]) -> None:
@@ -74,6 +100,7 @@ def test_values_at_the_edge_of_their_range_are_taken() -> None:
         }
     )
     load_configuration({"select_pairs": {"top_k": 100_000}})
+    load_configuration({"adjust_bundle": {"thresholds_px": [5, 5, 3], "refine_keypoints": True}})
 
 
 def test_scene_takes_the_name_of_its_folder_or_of_its_parent() -> None:

@@ -38,6 +38,18 @@ def plan_of(tmp_path: Path, **config: object) -> Plan:
     return Plan({"images": str(images), "output": str(tmp_path / "out"), **config})
 
 
+def empty_model(folder: Path) -> str:
+    """Files of a COLMAP model that nothing reads."""
+    for part in ("cameras", "images", "points3D"):
+        (folder / f"{part}.txt").write_bytes(b"")
+    return str(folder)
+
+
+def imported_by(config: dict[str, Any], folder: Path) -> dict[str, str]:
+    """The key that the front-end 'imported' needs, and others refuse."""
+    return {"imported": str(folder)} if config.get("front_end") == "imported" else {}
+
+
 def allowed(stage: str) -> set[str]:
     return set(typing.get_args(options_class(stage).model_fields["method"].annotation))
 
@@ -118,7 +130,7 @@ def test_the_size_of_batches_changes_what_a_job_asks_for_but_no_params(tmp_path:
 
 def test_exact_keypoints_are_not_refined_in_the_images(tmp_path: Path) -> None:
     for front_end, refined in (("virtual", False), ("sift", "auto")):
-        plan = plan_of(tmp_path, front_end=front_end, reference=str(tmp_path))
+        plan = plan_of(tmp_path, front_end=front_end, reference=empty_model(tmp_path))
         (scene,) = plan.scenes.values()
         options = json.loads(scene.params("adjust_bundle", {}, True))["options"]
         assert options["refine_keypoints"] == refined
@@ -211,7 +223,8 @@ def test_stages_after_matching_are_told_how_large_the_detector_saw_the_images(
     config: dict[str, Any], expected: dict[str, int], tmp_path: Path
 ) -> None:
     here = str(tmp_path)
-    plan = plan_of(tmp_path, weights=here, reference=here, imported=here, **config)
+    config = {**config, **imported_by(config, tmp_path)}
+    plan = plan_of(tmp_path, weights=here, reference=empty_model(tmp_path), **config)
     (scene,) = plan.scenes.values()
     for stage in ("merge_keypoints", *STAGES_IN_DETECTOR_PIXELS, "adjust_bundle"):
         told = json.loads(scene.params(stage, {"block": "0", "tile": "0-0"}, True))["settings"]
@@ -256,9 +269,9 @@ def test_masks_that_would_do_nothing_are_refused(
         (tmp_path / folder).mkdir()
     (tmp_path / "masks" / "1.png").write_bytes(b"mask")
     (tmp_path / "file").write_bytes(b"mask")
-    here = str(tmp_path)
+    config = {**config, **imported_by(config, tmp_path)}
     with pytest.raises(ConfigError, match=reason):
-        plan_of(tmp_path, masks=str(tmp_path / masks), weights=here, imported=here, **config)
+        plan_of(tmp_path, masks=str(tmp_path / masks), weights=str(tmp_path), **config)
 
 
 def test_networks_that_describe_images_need_no_keypoints_and_no_vocabulary(tmp_path: Path) -> None:

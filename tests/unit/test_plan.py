@@ -8,8 +8,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from snakesfm.blocks import choose_blocks, deal_blocks, tile_names
+from snakesfm.config.configuration import STAGES, options_class
+from snakesfm.digests import file_digest, settings_text
 from snakesfm.errors import ConfigError
 from snakesfm.plan import Plan
+from snakesfm.rule_settings import check_named_together
 from snakesfm.seeding import derive_seed
 
 
@@ -105,8 +108,38 @@ def test_scenes_of_other_sizes_have_rules_of_their_own(tmp_path: Path) -> None:
     scenes = {name: {"images": str(tmp_path / name)} for name in "ab"}
     plan = plan_of(tmp_path, scenes=scenes)
     assert plan.scenes_by_blocks() == {2: ["a"], 4: ["b"]}
-    assert plan.select_pairs_rule(2) == "select_pairs_2_blocks"
-    assert plan_of(tmp_path, scenes={"a": scenes["a"]}).select_pairs_rule(2) == "select_pairs"
+    assert [plan.select_pairs_rule(blocks) for blocks in (2, 4)] == [
+        "select_pairs_2_blocks",
+        "select_pairs",
+    ]
+    assert plan.select_pairs_twins() == {"select_pairs_2_blocks"}
+    more = plan_of(tmp_path, scenes=scenes | {"c": scenes["a"]})
+    assert [more.select_pairs_rule(blocks) for blocks in (2, 4)] == [
+        "select_pairs",
+        "select_pairs_4_blocks",
+    ]
+    one = plan_of(tmp_path, scenes={"a": scenes["a"]})
+    assert one.select_pairs_rule(2) == "select_pairs" and one.select_pairs_twins() == set()
+
+
+@pytest.mark.parametrize(
+    ("words", "is_refused"),
+    [
+        ("--until select_pairs", True),
+        ("--until=select_pairs", True),
+        ("-R match_pairs select_pairs", True),
+        ("--until select_pairs select_pairs_2_blocks", False),
+        ("--until match_pairs --set-resources select_pairs:mem_mb=10 --set-threads select_pairs=1", False),
+        ("--until select_pairs_2_blocks", False),
+    ],
+)
+def test_a_rule_is_named_with_its_twins_or_not_at_all(words: str, is_refused: bool) -> None:
+    if is_refused:
+        with pytest.raises(ConfigError, match="say 'select_pairs select_pairs_2_blocks'"):
+            check_named_together(words.split(), "select_pairs", {"select_pairs_2_blocks"})
+    else:
+        check_named_together(words.split(), "select_pairs", {"select_pairs_2_blocks"})
+    check_named_together(words.split(), "select_pairs", set())
 
 
 @pytest.mark.parametrize("output", ["{braces}", "a{b"])
@@ -114,3 +147,57 @@ def test_an_output_folder_with_braces_is_refused(tmp_path: Path, output: str) ->
     make_images(tmp_path / "scene", 2)
     with pytest.raises(ConfigError, match="braces"):
         Plan({"images": str(tmp_path / "scene"), "output": str(tmp_path / output)})
+
+
+def params_of(config: dict[str, str]) -> dict[str, str]:
+    """The params of every stage's job, of its first block or tile, as a new run has them."""
+    file_digest.cache_clear()
+    scene = Plan(config).scenes["scene"]
+    parts = {"block": "0", "tile": "0-0"}
+    return {stage: scene.params(stage, parts, True) for stage in STAGES}
+
+
+@pytest.mark.parametrize(
+    ("changed", "stages"),
+    [
+        ("scene/001.jpg", {"index_images"}),
+        ("cameras/cameras.txt", {"index_images"}),
+        ("cameras/images.txt", {"index_images"}),
+        ("masks/001.jpg.png", {"extract_features"}),
+        ("pairs.txt", {"select_pairs"}),
+        ("reference/images.txt", {"evaluate_model"}),
+        ("reference/points3D.txt", {"evaluate_model"}),
+    ],
+)
+def test_other_bytes_of_a_given_file_change_what_its_stage_is_told(
+    tmp_path: Path, changed: str, stages: set[str]
+) -> None:
+    make_images(tmp_path / "scene", 3)
+    config = {"images": str(tmp_path / "scene"), "output": str(tmp_path / "out")}
+    names = ("cameras/cameras.txt", "masks", "pairs.txt", "reference")
+    config |= {Path(name).parts[0].split(".")[0]: str(tmp_path / name) for name in names}
+    model = [f"reference/{part}.txt" for part in ("cameras", "images", "points3D")]
+    for name in ("cameras/cameras.txt", "cameras/images.txt", "masks/001.jpg.png", "pairs.txt", *model):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        # runs refuse known cameras that are none
+        (tmp_path / name).write_text("1 PINHOLE 640 480 500 500 320 240\n")
+    before = params_of(config)
+    (tmp_path / changed).write_text("1 PINHOLE 640 480 600 600 320 240\n")
+    after = params_of(config)
+    assert {stage for stage in STAGES if before[stage] != after[stage]} == stages
+
+
+@pytest.mark.parametrize("stage", STAGES)
+def test_another_version_of_a_stage_changes_what_it_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stage: str
+) -> None:
+    make_images(tmp_path / "scene", 3)
+    config = {"images": str(tmp_path / "scene"), "output": str(tmp_path / "out")}
+    before = params_of(config)
+    monkeypatch.setattr(options_class(stage), "stage_version", 999)
+    after = params_of(config)
+    assert {other for other in STAGES if before[other] != after[other]} == {stage}
+
+
+def test_settings_of_another_seed_are_others() -> None:
+    assert settings_text({}, 1) == settings_text({"images": "elsewhere"}, 1) != settings_text({}, 2)

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from snakesfm.errors import ConfigError
-from snakesfm.records import check_folder, forget, makes_nothing, unrecorded_files
+from snakesfm.records import check_folder, forget, makes_nothing, unrecorded_files, was_made_with
 
 NOBODY = 65534
 
@@ -47,12 +47,12 @@ def test_a_folder_without_room_for_records_is_named(
         check_folder("/opt/snakesfm/Snakefile")
 
 
-def write_record(records: Path, output: Path, endtime: float) -> list[str]:
+def write_record(records: Path, output: Path, endtime: float, *params: str) -> list[str]:
     code = urlsafe_b64encode(str(output).encode()).decode()
     parts = [code[k : k + 254] for k in range(0, len(code), 254)]
     record = records.joinpath(*[f"@{part}" for part in parts[:-1]], parts[-1])
     record.parent.mkdir(parents=True, exist_ok=True)
-    record.write_text(json.dumps({"endtime": endtime}))
+    record.write_text(json.dumps({"endtime": endtime, "params": [repr(text) for text in params]}))
     return parts
 
 
@@ -111,3 +111,12 @@ def test_a_forgotten_file_stays_and_is_older_than_all_and_unrecorded(tmp_path: P
 )
 def test_what_makes_nothing_is_told_by_its_arguments(arguments: list[str], nothing: bool) -> None:
     assert makes_nothing(arguments) == nothing
+
+
+def test_params_of_a_file_are_held_against_its_record(tmp_path: Path) -> None:
+    file, records = tmp_path / "a.h5", tmp_path / "records"
+    params = json.dumps({"settings": {"images": "it's \u00e4"}, "seed": 0})
+    assert was_made_with(str(file), params, records)
+    write_record(records, file, 1.0, params)
+    assert was_made_with(str(file), params, records)
+    assert not was_made_with(str(file), params.replace("0", "1"), records)

@@ -15,11 +15,13 @@ from snakesfm.config.configuration import check_spelling
 from snakesfm.job_server import JobServer
 from snakesfm.plan import Plan
 from snakesfm.records import check_folder, makes_nothing
+from snakesfm.rule_settings import check_named_together, share_resources
 from snakesfm.run import Run
+from snakesfm.termination import answer_term_aside
 
 
 def refusal(error):
-    """The error as one of Snakemake's, which '--quiet all' hides, so that the sentence is said here then."""
+    """The error as one of Snakemake's; '--quiet all' would hide it, so it is printed here in that case."""
     if Quietness.ALL in (workflow.output_settings.quiet or ()):
         sys.stderr.write(f"snakesfm: {error}\n")
     return WorkflowError(str(error))
@@ -32,6 +34,8 @@ try:
         check_folder(workflow.main_snakefile)
     check_spelling(config, sys.argv[1:])
     PLAN = Plan(config, weights_only="fetch_weights" in asked)
+    if workflow.is_main_process:
+        check_named_together(sys.argv[1:], "select_pairs", PLAN.select_pairs_twins())
     RUN = Run(PLAN)
     if workflow.is_main_process and not makes_nothing(sys.argv[1:]):
         RUN.refuse_unrecorded(asked)
@@ -131,7 +135,7 @@ def global_descriptors(wildcards):
 
 
 def previewed_features(wildcards):
-    """The features of all blocks where pairs are looked at before they are chosen, else nothing."""
+    """The features of all blocks if pairs are previewed before they are chosen, else nothing."""
     return PLAN.scenes[wildcards.scene].previewed_features()
 
 
@@ -251,8 +255,18 @@ def all_hloc_files():
     return [path for scene in PLAN.scenes.values() for path in scene.hloc_files()]
 
 
+def rules_by_scene(jobs):
+    """Per scene the names of the rules of these jobs."""
+    found = {}
+    for job in jobs:
+        if "scene" in job.wildcards.keys():
+            found.setdefault(job.wildcards.scene, set()).add(job.rule.name)
+    return found
+
+
 def start_run():
     """Lock the output folder for this run, and say what is about to be done."""
+    answer_term_aside(workflow.scheduler)
     executor = getattr(workflow.scheduler, "_executor", None)
     # the SLURM executor names all jobs of a run alike
     slurm_run = getattr(executor, "run_uuid", "")
@@ -269,10 +283,11 @@ def start_run():
 def finish_run(log):
     """One line per scene about its model."""
     JOB_SERVER.stop()
-    RUN.finish()
+    RUN.finish(rules_by_scene(workflow.dag.jobs))
 
 
 def fail_run(log):
     """One line per scene that ended well, and one per error."""
     JOB_SERVER.stop()
-    RUN.fail()
+    unfinished = rules_by_scene(workflow.dag.needrun_jobs()).keys()
+    RUN.fail(rules_by_scene(workflow.dag.jobs), unfinished)

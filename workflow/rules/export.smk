@@ -1,4 +1,4 @@
-# The model, and what it was made from, in the formats that others read, and how good it is.
+# The model and its inputs in the formats of other tools, and its evaluation.
 
 
 rule export_database:
@@ -56,6 +56,7 @@ rule export_hloc:
 rule export_model:
     input:
         index=artifact("index_images", "index.h5"),
+        cameras=artifact("calibrate_cameras", "cameras.h5"),
         reconstruction=artifact("adjust_bundle", "reconstruction.h5"),
     output:
         artifact("export_model", "sparse/0/cameras.bin"),

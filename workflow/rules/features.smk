@@ -56,6 +56,9 @@ rule describe_images:
         job_command("describe_images")
 
 
+share_resources(workflow.resource_settings, "select_pairs", PLAN.select_pairs_twins())
+
+
 # the outputs of a rule cannot depend on the scene, so scenes with another number of blocks have their own rule
 for blocks, scenes in PLAN.scenes_by_blocks().items():
 
@@ -72,7 +75,7 @@ for blocks, scenes in PLAN.scenes_by_blocks().items():
             log_file("select_pairs"),
         wildcard_constraints:
             scene=any_of(scenes),
-        # blocks of the similarity matrix are computed side by side, and pairs looked at
+        # blocks of the similarity matrix are computed in parallel, and so are previews of pairs
         threads: 2
         resources:
             mem_mb=memory_mb("select_pairs"),

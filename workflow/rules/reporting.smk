@@ -1,4 +1,4 @@
-# What a person reads.
+# The report.
 
 
 rule render_report:

@@ -1,4 +1,4 @@
-# The weights of the learned methods. Nothing depends on this rule: it runs where it is asked for by name.
+# The weights of the learned methods. Nothing depends on this rule: it runs only if it is requested by name.
 
 
 localrules:

@@ -1,4 +1,4 @@
-"""How every artifact is declared, written, read and checked.
+"""Declaration, writing, reading and checking of artifacts.
 
 An artifact is a frozen dataclass whose fields are declared with :func:`column`. One HDF5 file holds
 one artifact: a dataset per column, and root attributes that say what it is. A file is written to a

@@ -1,4 +1,4 @@
-"""Are the files that a job is about to read what the configuration says they are?"""
+"""Checks that the files a job is about to read belong to its scene and configuration."""
 
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Features and matches in the files of hloc (github.com/cvg/Hierarchical-Localization), read and written.
+"""Reading and writing of hloc's features and matches (github.com/cvg/Hierarchical-Localization).
 
 ``features.h5`` has a group per image with ``keypoints`` (N,2), ``descriptors`` (D,N), ``scores`` (N,) and
 ``image_size``; other tools write ``keypoints`` (N,4) as COLMAP has them. ``matches.h5`` has a group per

@@ -38,7 +38,7 @@ class CalibratedCameras(Artifact):
     """Intrinsics of every camera of the index, before bundle adjustment."""
 
     kind: ClassVar[str] = "calibrated_cameras"
-    format_version: ClassVar[int] = 2
+    format_version: ClassVar[int] = 3
 
     models: Array = column("(C)", "str", "COLMAP camera model name")
     sizes: Array = column("(C,2)", "int32", "width and height in pixels")
@@ -48,3 +48,10 @@ class CalibratedCameras(Artifact):
         "(C)", "float64", "relative standard deviation of the focal length, NaN if unknown"
     )
     pair_counts: Array = column("(C)", "int32", "pairs whose fundamental matrix voted on the focal")
+    overlay_cells: Array = column(
+        "(S,4)",
+        "int32",
+        "width and height of images in detector pixels, column and row of a cell of 8 of these that an "
+        "overlay covers",
+    )
+    warnings: Array = column("(W)", "str", "one sentence for each problem found")

@@ -1,4 +1,4 @@
-"""Keypoints of a point aligned to each other by the images' gray values.
+"""Alignment of a point's keypoints to each other by the images' gray values.
 
 A detector places each keypoint on its own; the pixels around the keypoints of one point show one piece of
 surface, and agree on its place several times better (Lindenberger et al., Pixel-Perfect
@@ -97,7 +97,7 @@ def align_observations(
     ----------
     read_gray : gives image k, or None where there are no pixels; called at most twice per image.
     images : (L,) int, image of each observation.
-    pixels : (L,2) float64, original pixels.
+    pixels : (L,2) float64, detector pixels.
     tangents : (L,2,2), how an observation moves in pixels with two coordinates on the point's plane.
     templates : (L,) int, row of the observation that is the template of each; of templates, their own.
     inside : (L,) bool, whether the patch lies in the image; others are left as they are.

@@ -1,4 +1,4 @@
-"""More observations for the model: tracks completed and merged, points made of left-out matches."""
+"""Completion of the model: tracks are completed and merged, points triangulated from unused matches."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -40,8 +40,8 @@ def correspondence_graph(
     return graph
 
 
-def drop_repeated_observations(reconstruction: pycolmap.Reconstruction) -> int:
-    """Keep the first of several observations of a point by one image; how many were dropped.
+def drop_repeated_observations(reconstruction: pycolmap.Reconstruction) -> None:
+    """Keep the first of several observations of a point by one image.
 
     pycolmap's completion and merging do not prevent them, notably where SIFT gave one place twice.
     """
@@ -49,52 +49,40 @@ def drop_repeated_observations(reconstruction: pycolmap.Reconstruction) -> int:
     points, images, rows = tracks.ids[tracks.point_rows], tracks.images, tracks.rows
     order = np.lexsort((rows, images, points))
     again = (np.diff(points[order]) == 0) & (np.diff(images[order]) == 0)
-    repeated = order[1:][again]
-    for row in repeated.tolist():
+    for row in order[1:][again].tolist():
         if reconstruction.exists_point3D(int(points[row])):
             reconstruction.delete_observation(int(images[row]) + 1, int(rows[row]))
-    return len(repeated)
 
 
-class TrackCompleter:
-    """pycolmap's incremental triangulator on one reconstruction.
+def complete_tracks(
+    reconstruction: pycolmap.Reconstruction,
+    graph: pycolmap.CorrespondenceGraph,
+    max_error_px: float,
+    min_angle_deg: float,
+    seed: int,
+    images: Sequence[int] | None = None,
+) -> None:
+    """Complete and merge all tracks by pycolmap's triangulator, and triangulate left-out matches.
 
     Parameters
     ----------
-    reconstruction, graph : kept alive as long as this object.
+    reconstruction : changed in place.
+    graph : inlier matches.
     max_error_px : largest reprojection error of an added observation.
     min_angle_deg : smallest triangulation angle of a new point.
     seed : of the robust estimation.
+    images : rows of the images whose left-out matches are triangulated; all registered ones if None.
     """
-
-    def __init__(
-        self,
-        reconstruction: pycolmap.Reconstruction,
-        graph: pycolmap.CorrespondenceGraph,
-        max_error_px: float,
-        min_angle_deg: float,
-        seed: int,
-    ) -> None:
-        self.reconstruction = reconstruction
-        self.graph = graph
-        self.options = pycolmap.IncrementalTriangulatorOptions()
-        self.options.complete_max_reproj_error = max_error_px
-        self.options.merge_max_reproj_error = max_error_px
-        self.options.min_angle = max(min_angle_deg, SMALLEST_ANGLE_DEG)
-        self.options.ignore_two_view_tracks = True
-        self.options.random_seed = seed
-
-    def __call__(self, images: Sequence[int] | None = None) -> int:
-        """Complete and merge all tracks, and triangulate the left-out matches of ``images`` (all if None).
-
-        Returns the number of observations that were added.
-        """
-        before = self.reconstruction.compute_num_observations()
-        triangulator = pycolmap.IncrementalTriangulator(self.graph, self.reconstruction)
-        registered = sorted(self.reconstruction.reg_image_ids())
-        for image_id in registered if images is None else [row + 1 for row in images]:
-            triangulator.triangulate_image(self.options, image_id)
-        triangulator.complete_all_tracks(self.options)
-        triangulator.merge_all_tracks(self.options)
-        drop_repeated_observations(self.reconstruction)
-        return int(self.reconstruction.compute_num_observations() - before)
+    options = pycolmap.IncrementalTriangulatorOptions()
+    options.complete_max_reproj_error = max_error_px
+    options.merge_max_reproj_error = max_error_px
+    options.min_angle = max(min_angle_deg, SMALLEST_ANGLE_DEG)
+    options.ignore_two_view_tracks = True
+    options.random_seed = seed
+    triangulator = pycolmap.IncrementalTriangulator(graph, reconstruction)
+    registered = sorted(reconstruction.reg_image_ids())
+    for image_id in registered if images is None else [row + 1 for row in images]:
+        triangulator.triangulate_image(options, image_id)
+    triangulator.complete_all_tracks(options)
+    triangulator.merge_all_tracks(options)
+    drop_repeated_observations(reconstruction)

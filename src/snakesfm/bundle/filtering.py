@@ -1,4 +1,4 @@
-"""What is taken out of the model between rounds: observations, points and images."""
+"""Removal of observations, points and images from the model between rounds."""
 
 import heapq
 from collections import Counter
@@ -13,7 +13,7 @@ def filter_observations(
     min_angle_deg: float,
     min_length: int = 2,
     sparse_observations: int = 0,
-) -> int:
+) -> None:
     """Drop observations with large errors, points with nearly parallel rays, and points too short.
 
     Parameters
@@ -22,15 +22,9 @@ def filter_observations(
     max_error_px : observations with larger errors, or behind the camera, are dropped one by one.
     min_angle_deg : points whose widest rays meet at less are dropped.
     min_length, sparse_observations : see :func:`drop_short_tracks`.
-
-    Returns
-    -------
-    How many observations were dropped.
     """
-    before = reconstruction.compute_num_observations()
     pycolmap.ObservationManager(reconstruction).filter_all_points3D(max_error_px, min_angle_deg)
     drop_short_tracks(reconstruction, min_length, sparse_observations)
-    return int(before - reconstruction.compute_num_observations())
 
 
 def drop_short_tracks(
@@ -62,9 +56,8 @@ def drop_short_tracks(
             reconstruction.delete_point3D(point_id)
 
 
-def deregister_weak_images(reconstruction: pycolmap.Reconstruction, min_observations: int) -> list[int]:
-    """Take out images with fewer observations, the weakest first; the rows that were taken out."""
-    taken: list[int] = []
+def deregister_weak_images(reconstruction: pycolmap.Reconstruction, min_observations: int) -> None:
+    """Take out images with fewer observations, the weakest first."""
     counts = {i: reconstruction.image(i).num_points3D for i in reconstruction.reg_image_ids()}
     heap = [(count, image_id) for image_id, count in counts.items()]
     heapq.heapify(heap)
@@ -79,13 +72,11 @@ def deregister_weak_images(reconstruction: pycolmap.Reconstruction, min_observat
             for element in reconstruction.point3D(keypoint.point3D_id).track.elements
         }
         reconstruction.deregister_frame(image.frame_id)
-        taken.append(image_id - 1)
         del counts[image_id]
         # points that two images saw are gone
         for other in sharing - {image_id}:
             counts[other] = reconstruction.image(other).num_points3D
             heapq.heappush(heap, (counts[other], other))
-    return taken
 
 
 def deregister_images_alone(

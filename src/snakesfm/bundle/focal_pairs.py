@@ -1,4 +1,4 @@
-"""Cameras of two focal lengths whose images tell one of them alone.
+"""Cameras with two focal lengths whose images determine only one of them.
 
 Where all cameras stand upright at one height, as around an object or along a street, the vertical focal
 length trades with the height of the world: nothing in the images tells the two apart. Most pixels are

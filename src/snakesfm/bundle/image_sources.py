@@ -1,4 +1,4 @@
-"""The images in gray, at the sizes at which keypoints are refined."""
+"""Gray images at the resolutions at which keypoints are refined."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace

@@ -1,9 +1,10 @@
-"""What a solver of bundle adjustment is given and gives back."""
+"""The interface of bundle adjustment solvers."""
 
 from dataclasses import dataclass
 from typing import Any, Literal, Protocol
 
 Loss = Literal["huber", "cauchy", "squared"]
+Solver = Literal["ceres", "gtsam"]
 
 
 @dataclass(frozen=True)
@@ -44,3 +45,14 @@ class BundleAdjuster(Protocol):
     def __call__(self, reconstruction: Any, settings: SolverSettings) -> tuple[float, float]:
         """Solve one pass."""
         ...
+
+
+def bundle_adjuster(solver: Solver) -> BundleAdjuster:
+    """The solver of a name."""
+    if solver == "gtsam":
+        from snakesfm.bundle.gtsam_solver import adjust_gtsam
+
+        return adjust_gtsam
+    from snakesfm.bundle.ceres import adjust_ceres
+
+    return adjust_ceres

@@ -1,4 +1,4 @@
-"""The keypoints of a reconstruction's observations aligned to each other in the images."""
+"""Refinement of a reconstruction's keypoints by aligning them to each other in the images."""
 
 from collections.abc import Callable
 from typing import Any

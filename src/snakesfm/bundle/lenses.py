@@ -1,4 +1,4 @@
-"""A wider camera model where a lens has another distortion than its camera's model."""
+"""Replacement of camera models that do not describe the lens by a more general one."""
 
 from collections.abc import Collection
 from typing import Any

@@ -1,4 +1,4 @@
-"""Models of several worlds: what of a scene belongs to which, and all of them together."""
+"""Several models of a scene, each in its own coordinate frame: splitting and joining."""
 
 from collections.abc import Sequence
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""Which cameras' principal points the model can tell."""
+"""Selection of the cameras whose principal points the model determines."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace

@@ -1,4 +1,4 @@
-"""The pose of one image by its matches to points of the model, where need be with its focal length."""
+"""The pose of one image from its matches to points of the model, and its focal length if unknown."""
 
 import copy
 from dataclasses import dataclass

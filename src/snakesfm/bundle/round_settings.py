@@ -1,49 +1,56 @@
-"""What the rounds of bundle adjustment are told, and what they say of themselves."""
+"""Settings of the rounds of bundle adjustment, and records of their results."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
-from snakesfm.bundle.interface import Loss
+from snakesfm.bundle.interface import Loss, Solver
 from snakesfm.bundle.wild_cameras import WildCause
 
 
 @dataclass(frozen=True)
 class RoundSettings:
-    """What is done in and between the rounds; see the options of adjust_bundle for each."""
+    """What is done in and between the rounds: the options of adjust_bundle that have these names, and more.
 
-    solver: Literal["ceres", "gtsam"] = "ceres"
-    thresholds_px: tuple[float, ...] = (10.0, 5.0, 3.0)
-    rotations_first: bool = False
-    loss_scale_px: float | Literal["auto"] = "auto"
-    loss_scale_sigmas: float = 3.5
-    early_loss_share: float = 0.4
-    last_loss: Loss = "huber"
-    outlier_sigmas: float = 12.0
-    distortion_from_round: int = 2
-    widen_lenses: bool = False
-    refine_principal_points: bool = True
-    max_principal_point_gap: float = 0.003
-    min_principal_point_offset: float = 0.004
-    max_principal_point_offset: float = 0.02
-    max_focal_change: float = 3.0
-    max_guessed_focal_change: float = 15.0
-    max_distortion: float = 1.0
-    complete_tracks: bool = True
-    complete_error_px: float = 4.0
-    register_images: bool = True
-    register_min_inliers: int = 15
-    register_min_ratio: float = 0.25
-    register_error_px: float = 6.0
-    min_angle_deg: float = 1.0
-    min_track_length: int = 3
-    sparse_observations: int = 100
-    min_observations: int = 10
-    select_above_images: int = 500
-    early_observations: int = 300
-    final_observations: int = 0
-    patient: bool = False
-    seed: int = 0
+    Parameters
+    ----------
+    widen_lenses : whether cameras may get a wider model.
+    patient : whether cheap passes take more steps than the solver is told.
+    seed : of what is drawn.
+    """
+
+    solver: Solver
+    thresholds_px: tuple[float, ...]
+    rotations_first: bool
+    loss_scale_px: float | Literal["auto"]
+    loss_scale_sigmas: float
+    early_loss_share: float
+    last_loss: Loss
+    outlier_sigmas: float
+    distortion_from_round: int
+    refine_principal_points: bool
+    max_principal_point_gap: float
+    min_principal_point_offset: float
+    max_principal_point_offset: float
+    max_focal_change: float
+    max_guessed_focal_change: float
+    max_distortion: float
+    complete_tracks: bool
+    complete_error_px: float
+    register_images: bool
+    register_min_inliers: int
+    register_min_ratio: float
+    register_error_px: float
+    min_angle_deg: float
+    min_track_length: int
+    sparse_observations: int
+    min_observations: int
+    select_above_images: int
+    early_observations: int
+    final_observations: int
+    widen_lenses: bool
+    patient: bool
+    seed: int
 
 
 @dataclass(frozen=True)

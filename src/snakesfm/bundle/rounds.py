@@ -4,9 +4,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence, Set
 from dataclasses import replace
 from typing import Literal
 
-import numpy as np
-
-from snakesfm.bundle.completion import TrackCompleter
+from snakesfm.bundle.completion import complete_tracks
 from snakesfm.bundle.filtering import (
     deregister_images_alone,
     deregister_weak_images,
@@ -21,7 +19,8 @@ from snakesfm.bundle.focal_pairs import (
     with_two_focals,
 )
 from snakesfm.bundle.image_sources import ImageSource
-from snakesfm.bundle.interface import BundleAdjuster, SolverSettings
+from snakesfm.bundle.interface import SolverSettings, bundle_adjuster
+from snakesfm.bundle.keypoint_noise import keypoint_noise_px
 from snakesfm.bundle.keypoint_refinement import refine_keypoints
 from snakesfm.bundle.lenses import find_wider_lenses, set_camera
 from snakesfm.bundle.principal_points import find_told_cameras
@@ -47,17 +46,6 @@ MOST_STEPS = 500
 EXACT_PX = 0.05
 
 
-def bundle_adjuster(solver: Literal["ceres", "gtsam"]) -> BundleAdjuster:
-    """The solver of a name."""
-    if solver == "gtsam":
-        from snakesfm.bundle.gtsam_solver import adjust_gtsam
-
-        return adjust_gtsam
-    from snakesfm.bundle.ceres import adjust_ceres
-
-    return adjust_ceres
-
-
 def adjust_rounds(
     reconstruction: pycolmap.Reconstruction,
     read_graph: Callable[[], pycolmap.CorrespondenceGraph],
@@ -66,7 +54,7 @@ def adjust_rounds(
     settings: RoundSettings,
     report: Callable[[RoundRecord], None],
     sources: Sequence[ImageSource] = (),
-) -> list[RoundRecord]:
+) -> None:
     """Adjust, filter and complete a model in rounds that each start from the result of the one before.
 
     Parameters
@@ -104,7 +92,6 @@ def adjust_rounds(
     mapper.tie_focal_lengths()
     if settings.register_images:
         mapper.add_left_out()
-    return mapper.records
 
 
 class _Mapper:
@@ -331,13 +318,14 @@ class _Mapper:
     def complete(self, images: Sequence[int] | None = None) -> None:
         """Complete and merge all tracks, and triangulate what ``images`` (all if None) left out."""
         settings = self.settings
-        TrackCompleter(
+        complete_tracks(
             self.reconstruction,
             self.graph,
             settings.complete_error_px,
             settings.min_angle_deg,
             settings.seed,
-        )(images)
+            images,
+        )
 
     def register(self) -> bool:
         """Register what can be; whether something was.
@@ -401,18 +389,3 @@ class _Mapper:
             for row, camera in enumerate(self.cameras)
             if is_guessed(camera) and row + 1 not in self.solving.constant_cameras
         }
-
-
-def keypoint_noise_px(reconstruction: pycolmap.Reconstruction) -> float:
-    """Standard deviation per axis of the keypoints, from the reprojection errors of the model.
-
-    The median over the points withstands wrong observations. The mean length of an error is sqrt(pi/2)
-    standard deviations, and each point takes three of the two degrees of freedom per observation.
-    """
-    reconstruction.update_point_3d_errors()
-    points = reconstruction.points3D.values()
-    errors = np.array([point.error for point in points])
-    lengths = np.array([point.track.length() for point in points])
-    if not len(errors):
-        return 1.0
-    return float(np.median(errors / np.sqrt(np.pi / 2 * (1 - 1.5 / lengths))))

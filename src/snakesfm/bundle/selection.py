@@ -1,4 +1,4 @@
-"""Large models adjusted by a selection of their points; the other points follow with the cameras held."""
+"""Adjustment of large models with a selection of their points; the others follow with fixed cameras."""
 
 from dataclasses import dataclass
 from typing import Any

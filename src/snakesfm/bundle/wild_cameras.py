@@ -1,4 +1,4 @@
-"""Cameras whose intrinsics left what is plausible, and what becomes of them."""
+"""Detection and reset of cameras whose intrinsics have become implausible."""
 
 from collections.abc import Mapping, Sequence
 from typing import Literal

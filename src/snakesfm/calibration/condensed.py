@@ -1,4 +1,4 @@
-"""Two-view problems condensed to nine numbers each way: what all points of a pair say of its matrix F.
+"""Two-view problems condensed to a quadratic form of the nine elements of the fundamental matrix.
 
 The sum of squared Sampson errors near a fundamental matrix is a quadratic form of the matrix's elements.
 With it, steps cost the same however many points there are, and are made for all pairs at once.

@@ -1,4 +1,4 @@
-"""Epipolar geometry of uncalibrated pairs, and which of them can tell a focal length."""
+"""Epipolar geometry of uncalibrated pairs, and selection of those that determine a focal length."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""Focal lengths of cameras that nobody calibrated, from matched pairs and what EXIF says."""
+"""Focal lengths of uncalibrated cameras from matched pairs and EXIF."""
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor

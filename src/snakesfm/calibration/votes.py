@@ -1,4 +1,4 @@
-"""A first guess of focal lengths: where fundamental matrices become essential ones."""
+"""Initial focal lengths: those that turn fundamental matrices into essential matrices."""
 
 from collections.abc import Sequence
 from typing import Any

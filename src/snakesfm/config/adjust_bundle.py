@@ -152,6 +152,12 @@ class AdjustBundleOptions(StageOptions):
     300 times this."""
 
     @model_validator(mode="after")
+    def _let_thresholds_fall(self) -> Self:
+        if any(later > earlier for earlier, later in pairwise(self.thresholds_px)):
+            raise ValueError("thresholds_px must not rise: no round may have a larger one than that before")
+        return self
+
+    @model_validator(mode="after")
     def _refine_in_ever_finer_images(self) -> Self:
         if any(finer <= coarser for coarser, finer in pairwise(self.refine_finenesses)):
             raise ValueError("refine_finenesses must increase: each resolution must exceed the one before")

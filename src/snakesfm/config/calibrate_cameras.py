@@ -10,7 +10,7 @@ from snakesfm.config.base import StageOptions
 class CalibrateCamerasOptions(StageOptions):
     """How unknown focal lengths are estimated before any pose is known."""
 
-    stage_version: ClassVar[int] = 5
+    stage_version: ClassVar[int] = 6
 
     estimate_focals: bool = True
     """Estimate unknown focal lengths from fundamental matrices; otherwise the priors are kept."""
@@ -47,6 +47,10 @@ class CalibrateCamerasOptions(StageOptions):
 
     default_sigma: float = Field(default=0.5, gt=0, le=10)
     """Relative standard deviation of the default focal length, as a prior."""
+
+    overlay_share: float = Field(default=0.3, ge=0, le=1)
+    """Matches that do not move are left out where this share of the pairs has such: a time stamp, a logo, a
+    car's bonnet, the fixed background of a turntable (0: keep all)."""
 
     @model_validator(mode="after")
     def _refuse_an_empty_range(self) -> Self:

@@ -1,4 +1,4 @@
-"""The whole configuration: what config.yaml and ``--config`` may hold."""
+"""The whole configuration: what config.yaml and ``--config`` may contain."""
 
 import datetime
 import difflib
@@ -9,9 +9,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, create_model, model_validator
+from pydantic import BaseModel, Field, ValidationError, create_model, model_validator
+from pydantic_core import ErrorDetails
 
-from snakesfm.config.base import StageOptions
+from snakesfm.config.base import Options, StageOptions
 from snakesfm.errors import ConfigError
 
 STAGES: tuple[str, ...] = (
@@ -52,6 +53,18 @@ TEXT_KEYS = (
     "weights",
 )
 
+# pydantic's types of errors, and what was expected in plain words
+KINDS = {
+    "bool_type": "true or false",
+    "bool_parsing": "true or false",
+    "int_type": "a whole number",
+    "int_parsing": "a whole number",
+    "int_from_float": "a whole number",
+    "float_type": "a number",
+    "float_parsing": "a number",
+    "string_type": "text",
+}
+
 SCENE_PATTERN = r"[^/.{}][^/{}]*"
 
 
@@ -63,10 +76,8 @@ def options_class(stage: str) -> type[StageOptions]:
     return cls
 
 
-class SceneInputs(BaseModel):
+class SceneInputs(Options):
     """Where one scene's images and what is known about them are found."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     images: str
     """Folder of photographs, searched with all its subfolders."""
@@ -100,10 +111,8 @@ FrontEndName = Literal[
 ]
 
 
-class RunOptions(BaseModel):
+class RunOptions(Options):
     """Options of the whole run."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     images: str = "demo/images"
     """Folder of photographs, searched with all its subfolders; unused if `scenes` lists any."""
@@ -209,10 +218,14 @@ def load_configuration(values: Mapping[str, Any]) -> RunOptions:
 
 def _one_sentence(cls: type[BaseModel], error: ValidationError) -> str:
     """The first problem in one sentence that names the key and the remedy."""
-    first, *others = error.errors()
-    path = [str(part) for part in first["loc"] if not str(part).startswith("function-")]
-    # what follows the option's name is pydantic's name of one of several types
-    path = path[: {"scenes": 3}.get(path[0], 2 if path[0] in STAGES else 1)]
+    errors = error.errors()
+    first = errors[0]
+    path = _path_of(first)
+    if first["type"] == "missing":
+        # a key that is spelled wrongly says more than the one that is missing by that
+        slips = (other for other in errors if other["type"] == "extra_forbidden")
+        first = next((other for other in slips if other["loc"][:-1] == first["loc"][:-1]), first)
+        path = _path_of(first)
     key = ".".join(path)
     if first["type"] == "extra_forbidden":
         known = _keys_beside(cls, path)
@@ -222,18 +235,53 @@ def _one_sentence(cls: type[BaseModel], error: ValidationError) -> str:
         nearest = elsewhere or difflib.get_close_matches(path[-1], known, n=1, cutoff=0.5)
         hint = f"did you mean '{nearest[0]}'" if nearest else f"the known keys are {', '.join(known)}"
         return f"Unknown configuration key '{key}': {hint}?" if nearest else f"Unknown key '{key}': {hint}."
+    if first["type"] == "missing":
+        return f"Configuration key '{key}' is missing: set it."
+    if first["type"] in ("model_type", "dict_type"):
+        return _refused_block(key, first["input"], [_path_of(other)[-1] for other in errors[1:]])
+    if first["input"] is None:
+        return f"Configuration key '{key}' has no value: set one or remove the key."
+    # an option of several types has an error for each
+    same = [other for other in errors if _path_of(other) == path]
+    kinds = [other for other in same if other["type"] != "literal_error"]
+    words = [f" (or {other['ctx']['expected']})" for other in same if other not in kinds and kinds]
+    first = (kinds or same)[0]
     message = first["msg"].removeprefix("Value error, ")
     message = re.sub(r"^Input", "the value", message)
-    words = [
-        f" (or {other['ctx']['expected']})"
-        for other in others
-        if other["type"] == "literal_error" and other["loc"][:-1] == first["loc"][:-1]
-    ]
-    message = message[:1].lower() + message[1:] + "".join(words)
+    message = message[:1].lower() + message[1:]
+    if first["type"] in KINDS:
+        message = f"the value should be {KINDS[first['type']]}"
+    elif first["type"] == "tuple_type":
+        example = list(options_class(path[0]).model_fields[path[1]].default)
+        message = f"the value should be a list such as {example}"
     # a check of several options together is handed the whole block
     together = first["type"] == "value_error" and isinstance(first["input"], dict)
-    given = "" if together else f" = {first['input']!r}"
-    return f"Configuration key '{key}'{given}: {message}."
+    given = "" if together else f" = {_as_written(first['input'])}"
+    return f"Configuration key '{key}'{given}: {message}{''.join(words)}."
+
+
+def _path_of(error: ErrorDetails) -> list[str]:
+    """The keys that lead to the option that an error is about."""
+    path = [str(part) for part in error["loc"] if not str(part).startswith("function-")]
+    # what follows the option's name is pydantic's name of one of several types
+    return path[: {"scenes": 3}.get(path[0], 2 if path[0] in STAGES else 1)]
+
+
+def _as_written(value: Any) -> str:
+    """A value as YAML has it where Python writes it otherwise."""
+    if isinstance(value, list):
+        return f"[{', '.join(map(_as_written, value))}]"
+    return str(value).lower() if isinstance(value, bool) else repr(value)
+
+
+def _refused_block(key: str, value: Any, others: Sequence[str]) -> str:
+    """What is said where a block of keys was expected, and of those that stand beside it instead."""
+    given = "has no value" if value is None else f"= {_as_written(value)}"
+    known = options_class(key).model_fields if key in STAGES else SceneInputs.model_fields
+    stray = [name for name in others if key != "scenes" and name in known]
+    what = "one block of keys per scene" if key == "scenes" else "a block of options"
+    remedy = f", such as '{stray[0]}', which stands beside it" if stray else " or in braces"
+    return f"Configuration key '{key}' {given}: it should hold {what}, indented below it{remedy}."
 
 
 def _keys_beside(cls: type[BaseModel], path: list[str]) -> list[str]:

@@ -15,7 +15,7 @@ SHORTLIST = 100
 class SelectPairsOptions(StageOptions):
     """Which pairs of images are matched."""
 
-    stage_version: ClassVar[int] = 4
+    stage_version: ClassVar[int] = 5
 
     method: Literal[
         "auto",
@@ -41,8 +41,8 @@ class SelectPairsOptions(StageOptions):
     """Candidate partners proposed per image; 'auto' is 100 if candidates are previewed, otherwise 15
     (30 from 500 images on)."""
 
-    min_score: float = Field(0.0, ge=-1.0, le=1.0)
-    """Smallest similarity of a pair proposed by 'retrieval'."""
+    min_score: float = Field(-1.0, ge=-1.0, le=1.0)
+    """Smallest similarity of a pair proposed by 'retrieval'; -1 leaves out none."""
 
     preview_keypoints: int = Field(400, ge=0, le=10_000)
     """Number of largest SIFT keypoints per image with which proposed pairs are previewed before

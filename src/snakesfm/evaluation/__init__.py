@@ -1,1 +1,1 @@
-"""How good a model is: alignment to a reference, pose errors and the areas under their recall curves."""
+"""Accuracy of a model: alignment to a reference, pose errors and the areas under their recall curves."""

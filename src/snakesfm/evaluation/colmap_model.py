@@ -7,9 +7,7 @@ import numpy as np
 from snakesfm.errors import ConfigError
 from snakesfm.evaluation.metrics import Poses
 from snakesfm.geometry.colmap_binding import pycolmap
-
-SUFFIXES = (".bin", ".txt")
-PLACES = (".", "sparse/0", "sparse", "0")
+from snakesfm.given_files import NO_MODEL, find_model_folder
 
 
 def find_model(folder: Path) -> Path:
@@ -19,16 +17,10 @@ def find_model(folder: Path) -> Path:
     ------
     ConfigError : none of them holds a COLMAP model.
     """
-    for place in PLACES:
-        for suffix in SUFFIXES:
-            if all(
-                (folder / place / f"{part}{suffix}").is_file() for part in ("cameras", "images", "points3D")
-            ):
-                return folder / place
-    raise ConfigError(
-        f"{folder} does not contain a COLMAP model: give a folder with cameras, images and points3D "
-        "as .bin or .txt, or the folder above its sparse/0."
-    )
+    place = find_model_folder(folder)
+    if place is None:
+        raise ConfigError(f"{folder} {NO_MODEL}")
+    return place
 
 
 def read_model(folder: Path) -> pycolmap.Reconstruction:

@@ -1,4 +1,4 @@
-"""The metrics of a model: against reference poses, and those that need no truth."""
+"""The metrics of a model: against reference poses, and those that need no reference."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from snakesfm.evaluation.alignment import Similarity, align_poses
+from snakesfm.evaluation.alignment import align_poses
 from snakesfm.evaluation.pose_errors import (
     FAILED_DEG,
     chordal_angle_deg,
@@ -47,7 +47,7 @@ class PoseEvaluation:
 
     ``names`` are those of the scored reference images; ``rotation_deg``, ``position`` (reference units) and
     ``direction_deg`` (angle between the position vectors from the reference's origin) are NaN where the
-    image is not registered. ``reference_from_model`` is None where no scored image is registered.
+    image is not registered.
     """
 
     metrics: Metrics
@@ -55,7 +55,6 @@ class PoseEvaluation:
     rotation_deg: Array = field(default_factory=lambda: np.zeros(0))
     position: Array = field(default_factory=lambda: np.zeros(0))
     direction_deg: Array = field(default_factory=lambda: np.zeros(0))
-    reference_from_model: Similarity | None = None
 
     def per_image(self) -> dict[str, dict[str, float | None]]:
         """The errors of every scored image by its name, None where it is not registered."""
@@ -149,7 +148,7 @@ def evaluate_poses(
     metrics |= _distribution("position_error_percent", relative_position)
     metrics["reference_extent"] = extent
     metrics["alignment_scale"] = None if similarity is None else similarity.scale
-    return PoseEvaluation(metrics, names, rotation_deg, position, direction_deg, similarity)
+    return PoseEvaluation(metrics, names, rotation_deg, position, direction_deg)
 
 
 def model_metrics(registered: Array, offsets: Array, errors_px: Array) -> Metrics:

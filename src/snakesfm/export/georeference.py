@@ -1,4 +1,4 @@
-"""Where on the earth a model is, by the positions that cameras wrote into EXIF."""
+"""Georeferencing of a model by the GPS positions in EXIF."""
 
 from dataclasses import dataclass
 from typing import Any

@@ -1,4 +1,4 @@
-"""The folder ``images`` beside an exported model."""
+"""The folder ``images`` next to an exported model."""
 
 import os
 import shutil

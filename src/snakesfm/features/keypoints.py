@@ -1,4 +1,4 @@
-"""Local features of one image, and the interface of what finds them."""
+"""Local features of one image, and the interface of detectors."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

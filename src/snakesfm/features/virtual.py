@@ -1,4 +1,4 @@
-"""The oracle ``virtual``: keypoints that are known of an image instead of found in it."""
+"""The oracle ``virtual``: keypoints projected from a known model instead of detected in the image."""
 
 from typing import Any
 

@@ -36,6 +36,12 @@ def detector_scales(sizes: Array, settings: Mapping[str, Any]) -> Array:
     return scales
 
 
+def detector_sizes(sizes: Array, settings: Mapping[str, Any]) -> Array:
+    """Sizes (N,2) of images in detector pixels, int32; arguments as for :func:`detector_scales`."""
+    reduced: Array = np.rint(sizes / detector_scales(sizes, settings)[:, None]).astype(np.int32)
+    return reduced
+
+
 def reduce_keypoints(keypoints: Array, scale: float) -> Array:
     """Keypoints (K,2) of one image from original pixels to detector pixels, of the same dtype."""
     return keypoints if scale == 1.0 else keypoints / keypoints.dtype.type(scale)

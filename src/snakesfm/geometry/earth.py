@@ -1,4 +1,4 @@
-"""Positions on the earth in a local world of metres."""
+"""Positions on the earth in a local coordinate frame in metres."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""Whether a camera's distortion is that of its lens."""
+"""Test of whether a camera model describes the distortion of the lens."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass

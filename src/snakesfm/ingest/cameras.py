@@ -1,4 +1,4 @@
-"""Which images were taken by one camera, and what its intrinsics are before anything is measured."""
+"""Assignment of images to cameras, and the initial intrinsics of these."""
 
 import re
 from bisect import bisect_left, bisect_right

@@ -1,4 +1,4 @@
-"""What EXIF says of the camera: body, lens, focal length and place."""
+"""Camera data from EXIF: body, lens, focal length and GPS position."""
 
 import functools
 import math

@@ -12,10 +12,10 @@ import numpy as np
 from snakesfm.errors import ConfigError
 from snakesfm.geometry.camera import Camera
 from snakesfm.geometry.colmap_binding import pycolmap
+from snakesfm.given_files import NO_CAMERAS, NO_CAMERAS_FILE, find_cameras_file
 from snakesfm.image_names import match_names
 from snakesfm.ingest.cameras import Photograph
 
-FILE_NAMES = ("cameras.bin", "cameras.txt", "K.txt")
 # images.bin: quaternion and translation between image id and camera id
 POSE_BYTES = 56
 POINT_BYTES = 24
@@ -69,10 +69,7 @@ def read_known_cameras(path: Path | str) -> KnownCameras:
                 return KnownCameras(path, {1: _matrix_camera(path, rows)}, {})
             cameras = dict(_text_cameras(lines))
     except (ValueError, UnicodeDecodeError, struct.error, IndexError) as error:
-        raise ConfigError(
-            f"{path}, given as cameras=, is neither a COLMAP cameras file nor a 3x3 matrix ({error}): "
-            "correct it."
-        ) from None
+        raise ConfigError(f"{path}, given as cameras=, {NO_CAMERAS} ({error}): correct it.") from None
     if not cameras:
         raise ConfigError(f"{path}, given as cameras=, contains no camera: correct it or remove the key.")
     for camera_id, camera in cameras.items():
@@ -183,16 +180,12 @@ def _match_size(known: KnownCameras, photograph: Photograph) -> Camera:
 
 def _find_file(path: Path) -> Path:
     path = path.expanduser()
-    if path.is_dir():
-        for name in FILE_NAMES:
-            if (path / name).is_file():
-                return path / name
-        raise ConfigError(
-            f"{path}, given as cameras=, contains none of {', '.join(FILE_NAMES)}: give the file's path."
-        )
-    if not path.is_file():
+    file = find_cameras_file(path)
+    if file is None and path.is_dir():
+        raise ConfigError(f"{path}, given as cameras=, {NO_CAMERAS_FILE}")
+    if file is None:
         raise ConfigError(f"{path}, given as cameras=, does not exist: correct the path or remove the key.")
-    return path
+    return file
 
 
 def _content_lines(path: Path) -> list[str]:

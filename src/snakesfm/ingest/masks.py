@@ -1,4 +1,4 @@
-"""Masks: which parts of the images keypoints are wanted of.
+"""Masks: the parts of the images in which keypoints are wanted.
 
 A mask is black where an image shows what is not to be used, such as sky, water, people or a turntable. That
 of ``a/b.jpg`` is ``a/b.jpg.png`` in the folder of masks, as in COLMAP; ``a/b.png`` does as well.

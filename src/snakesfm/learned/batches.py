@@ -1,4 +1,4 @@
-"""How many images or pairs a network gets at once, and which of them fit together."""
+"""Batches of images or pairs for a network: their size, and which items fit together."""
 
 from collections.abc import Hashable, Sequence
 from typing import Literal

@@ -1,4 +1,4 @@
-"""Fill the weights folder, where there is internet: ``python -m snakesfm.learned.fetch FOLDER MODEL...``.
+"""Download network weights: ``python -m snakesfm.learned.fetch FOLDER MODEL...``.
 
 This is what the target ``fetch_weights`` runs. Jobs never do: they read the folder.
 """

@@ -1,4 +1,4 @@
-"""Mutual nearest neighbours with the ratio test, searched only among descriptors of like words."""
+"""Mutual nearest neighbours with the ratio test, searched only among descriptors of similar words."""
 
 from dataclasses import dataclass
 from typing import Any

@@ -1,4 +1,4 @@
-"""The interface of what matches two images without keypoints."""
+"""The interface of matchers without keypoints."""
 
 import importlib
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""The interface of what matches two images."""
+"""The interface of matchers."""
 
 import importlib
 from collections.abc import Callable, Sequence

@@ -1,4 +1,4 @@
-"""Keypoints out of the coordinates that a detector-free matcher gives pair by pair.
+"""Merging of the coordinates from a detector-free matcher into keypoints.
 
 Such a matcher finds a place anew in every pair, up to some pixels from where it found it in another pair.
 If every coordinate were a keypoint, nearly every track would end after two images. Coordinates of one image

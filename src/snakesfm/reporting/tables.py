@@ -11,6 +11,8 @@ from snakesfm.reporting.registration import ImageCounts
 
 Array = NDArray[Any]
 STATISTICS = ("median", "mean", "p90", "max")
+AREAS = re.compile(r"(?P<row>.*_auc)_(?P<column>[\d.]+)deg")
+ERRORS = re.compile(rf"(?P<row>.*)_(?P<column>{'|'.join(STATISTICS)})")
 
 
 def label_counts(labels: Array, names: Sequence[str]) -> list[tuple[str, int]]:
@@ -37,10 +39,13 @@ def metric_tables(metrics: Mapping[str, Any]) -> list[tuple[str, list[str], list
         for name, value in metrics.items()
         if isinstance(value, int | float) and not isinstance(value, bool)
     }
-    areas = _grouped(numbers, re.compile(r"(?P<row>.*_auc)_(?P<column>[\d.]+)deg"))
-    errors = _grouped(numbers, re.compile(r"(?P<row>.*)_(?P<column>median|mean|p90|max)"))
+    areas, errors = _grouped(numbers, AREAS), _grouped(numbers, ERRORS)
     thresholds = sorted({column for row in areas.values() for column in row}, key=float)
-    others = [[_words(name), value] for name, value in numbers.items() if not _is_grouped(name)]
+    others = [
+        [_words(name), value]
+        for name, value in numbers.items()
+        if not AREAS.fullmatch(name) and not ERRORS.fullmatch(name)
+    ]
     return [
         (
             "Accuracy: area under the recall curve, percent",
@@ -63,10 +68,6 @@ def _grouped(numbers: Mapping[str, Any], pattern: re.Pattern[str]) -> dict[str, 
         if match:
             groups.setdefault(match["row"], {})[match["column"]] = value
     return groups
-
-
-def _is_grouped(name: str) -> bool:
-    return re.fullmatch(r".*_auc_[\d.]+deg|.*_(median|mean|p90|max)", name) is not None
 
 
 def _words(name: str) -> str:

@@ -1,1 +1,1 @@
-"""Which images may see the same things: global descriptors and the choice of image pairs."""
+"""Candidate image pairs: global descriptors and pair selection."""

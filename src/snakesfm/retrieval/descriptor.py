@@ -1,4 +1,4 @@
-"""The interface of networks that sum up an image in one vector."""
+"""The interface of networks that summarise an image in one vector."""
 
 import importlib
 from collections.abc import Callable, Sequence

@@ -127,7 +127,7 @@ def similar_pairs(
     blocks : image rows (n_a,) of each block.
     read_block : gives the descriptors (n_a,D) float32 of a block, as ``round_units`` has them.
     top_k : most partners that an image chooses; it may be chosen by more. Ties go to the smaller row.
-    min_score : least similarity, a dot product; images without features (similarity 0) are never paired.
+    min_score : least similarity, as :func:`similarities_of` has it; -1 keeps all that are finite.
     held_bytes : blocks are held until their descriptors take so much memory; at least one is.
     threads : how many blocks of the matrix are computed at a time; changes nothing in the result.
     """
@@ -153,18 +153,32 @@ def similar_pairs(
                 }
                 best = {row: task.result() for row, task in tasks.items()}
         for row, (ids, similarities) in best.items():
-            image, slot = np.nonzero((similarities >= min_score) & (similarities > 0))
+            # rounding lengthens descriptors: two that are opposite may give less than -1
+            kept = (similarities >= min_score) | (min_score == -1)
+            image, slot = np.nonzero(kept & np.isfinite(similarities))
             found.append(np.column_stack([blocks[row][image], ids[image, slot]]))
             scores.append(similarities[image, slot])
     pairs = np.concatenate(found) if found else np.zeros((0, 2))
     return PairTable.of(pairs, "retrieved", np.concatenate(scores) if scores else None)
 
 
+def similarities_of(own: Array, other: Array) -> Array:
+    """Dot products (n,m) float32 of descriptors (n,D) and (m,D); -inf for images without features.
+
+    The descriptors of these are zeros. Images that have features may well have a negative similarity: most
+    pairs of a small scene do, as the vocabulary is learned on the scene itself.
+    """
+    similarities: Array = own @ other.T
+    similarities[~own.any(axis=1)] = -np.inf
+    similarities[:, ~other.any(axis=1)] = -np.inf
+    return similarities
+
+
 def _widen(
     best: tuple[Array, Array], own: Array, same: bool, more_ids: Array, other: Array, top_k: int
 ) -> tuple[Array, Array]:
     """The best partners of a block's images, of those found before and of one more block (or its own)."""
-    similarity = own @ other.T
+    similarity = similarities_of(own, other)
     if same:
         np.fill_diagonal(similarity, -np.inf)
     return _largest(*best, more_ids, similarity, top_k)

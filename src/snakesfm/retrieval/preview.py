@@ -1,4 +1,4 @@
-"""A cheap look at two images before they are matched: do their largest keypoints resemble each other?
+"""A cheap preview of image pairs before matching: the likeness of their largest keypoints.
 
 Pre-emptive matching (Wu 2013, "Towards linear-time incremental structure from motion", section 3.1): of two
 images that see the same, keypoints of large scale match too. Wu counts the matches of the ratio test; among
@@ -18,7 +18,7 @@ from snakesfm.matching.nearest import augmented, pop_two_largest
 Array = NDArray[Any]
 
 FEWEST_KEYPOINTS = 50
-"""By which images with few keypoints are looked at."""
+"""Keypoints by which images with few of them are previewed."""
 # images that see parts of one view are fewer partners apart
 LOOP_STEPS = 4
 
@@ -56,9 +56,9 @@ def look_at_pairs(pairs: Array, previews: Sequence[Array], count: int, threads: 
     ----------
     pairs : (P,2) rows of images.
     previews : descriptors (n,D) of each image's largest keypoints.
-    count : how many keypoints an image that has enough is looked at by; fewer resemble others the less, and
-        their likeness is given as if there were so many.
-    threads : how many pairs are looked at at a time; changes nothing in the result.
+    count : keypoints compared per image, if it has enough; fewer keypoints resemble others less, so their
+        likeness is scaled up to this number.
+    threads : how many pairs are previewed at a time; changes nothing in the result.
 
     Returns
     -------
@@ -91,7 +91,7 @@ def alike_pairs(
     ----------
     pairs : (P,2) rows of images, distinct.
     likenesses : (P,) as :func:`look_at_pairs` has them.
-    unsure : (P,) bool, pairs that were looked at by too few keypoints to tell strangers by; they stay.
+    unsure : (P,) bool, pairs previewed with too few keypoints to recognise unrelated images; they stay.
     min_likeness : what is enough.
     least_partners : of each image so many stay however little they resemble it.
     """

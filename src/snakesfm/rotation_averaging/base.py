@@ -1,4 +1,4 @@
-"""What every rotation averager offers, and what they share."""
+"""The interface of rotation averagers, and code that they share."""
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass

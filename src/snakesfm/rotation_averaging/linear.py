@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from snakesfm.geometry.rotations import exp_so3, log_so3
 from snakesfm.geometry.sparse_systems import solve_spd
+from snakesfm.grouping import sum_by
 
 Array = NDArray[Any]
 
@@ -44,14 +45,7 @@ def solve_isotropic(node_count: int, pairs: Array, weights: Array, residuals: Ar
     values = np.concatenate([weights, weights, -weights, -weights])
     laplacian = coo_array((values, (rows, columns)), shape=(node_count, node_count)).tocsc()
     weighted = weights[:, None] * residuals
-    right = np.stack(
-        [
-            np.bincount(tails, weighted[:, axis], node_count)
-            - np.bincount(heads, weighted[:, axis], node_count)
-            for axis in range(3)
-        ],
-        axis=1,
-    )
+    right = sum_by(weighted, tails, node_count) - sum_by(weighted, heads, node_count)
     increments = np.zeros((node_count, 3))
     increments[1:] = _solve(laplacian[1:, 1:], right[1:], 2.0 * len(pairs) / node_count)
     return increments
@@ -76,10 +70,7 @@ def solve_anisotropic(node_count: int, pairs: Array, information: Array, residua
     size = 3 * node_count
     hessian = coo_array((values.ravel(), (rows.ravel(), columns.ravel())), shape=(size, size)).tocsc()
     weighted = np.einsum("eab,eb->ea", information, residuals)
-    right = np.zeros((node_count, 3))
-    for axis in range(3):
-        right[:, axis] = np.bincount(tails, weighted[:, axis], node_count)
-        right[:, axis] -= np.bincount(heads, weighted[:, axis], node_count)
+    right = sum_by(weighted, tails, node_count) - sum_by(weighted, heads, node_count)
     increments = np.zeros(size)
     solved = _solve(hessian[3:, 3:], right.ravel()[3:, None], 2.0 * len(pairs) / node_count, block=3)
     increments[3:] = solved[:, 0]

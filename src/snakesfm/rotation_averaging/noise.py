@@ -1,4 +1,4 @@
-"""How far the relative rotations of a graph can be trusted: a noise model fitted to their residuals."""
+"""A noise model of the relative rotations of a graph, fitted to their residuals."""
 
 import itertools
 from typing import Any

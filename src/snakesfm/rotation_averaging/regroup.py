@@ -1,4 +1,4 @@
-"""Groups of rotations that hang together by single edges, joined anew by a vote of all edges."""
+"""Re-joining of groups of rotations that are connected by single edges, by a vote of all edges."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""Which edges do not fit averaged rotations."""
+"""Rejection of edges that do not fit the averaged rotations."""
 
 from typing import Any
 

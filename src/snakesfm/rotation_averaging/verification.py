@@ -1,4 +1,4 @@
-"""Averaging a filtered view graph: rotations, and which edges agree with them, refused ones included."""
+"""Averaging of a filtered view graph; all edges, refused ones included, are then tested again."""
 
 from dataclasses import replace
 from typing import Any
@@ -37,7 +37,7 @@ def average_components(
 
     Returns
     -------
-    rotations : (N,3,3) cam_from_world, each component in a world of its own, NaN where there is none.
+    rotations : (N,3,3) cam_from_world, each component in its own frame, NaN where there is none.
     reasons : (E,) str; ``rotation_residual`` and ``component`` where refused here.
     components : (N,) int32 of the images that have a rotation, 0 the first; -1 for others.
     """
@@ -99,7 +99,7 @@ def average_view_graph(
         )
 
     kept = reasons == "kept"
-    components = keep_largest_component(graph.node_count, graph.pairs, reasons)[1]
+    components = label_components(graph.node_count, graph.pairs[kept])
     rotations = average(kept)
     judging = rotations if kept.all() else _improve_on_all(graph, rotations)
     for remaining in range(passes - 1, -1, -1):

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 
 def run(job: StageJob) -> None:
-    """Position the images that have a rotation, each component of them in a world of its own.
+    """Position the images that have a rotation, each component in its own coordinate frame.
 
     Edges take part that every filter kept and whose translation has a direction; rays of the tracks take
     part as far as ``rays_per_camera`` allows.

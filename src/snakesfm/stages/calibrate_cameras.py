@@ -1,6 +1,6 @@
-"""Stage calibrate_cameras: focal lengths that nobody gave, from the matches."""
+"""Stage calibrate_cameras: unknown focal lengths from the matches."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,10 +14,12 @@ from snakesfm.artifacts.pairs import PairMatches
 from snakesfm.geometry.camera import Camera, cameras_from_columns, cameras_to_columns
 from snakesfm.geometry.detector_pixels import (
     detector_scales,
+    detector_sizes,
     reduce_cameras,
     reduce_keypoints,
     restore_cameras,
 )
+from snakesfm.matching.overlays import covered_shares, find_moving_matches, find_overlay_cells
 from snakesfm.stages.job import StageJob
 
 if TYPE_CHECKING:
@@ -25,10 +27,20 @@ if TYPE_CHECKING:
 
 Array = NDArray[Any]
 GIVEN_SIGMA = 0.0
+# more pairs show no other overlay, and cost time
+OVERLAY_PAIRS = 3000
+OVERLAY = (
+    "{percent:.1f} % of the image area is the same in all images of one size (a time stamp, a logo, part "
+    "of the vehicle, a fixed background?): matches that do not move there are left out. If this is part "
+    "of the scene, set calibrate_cameras.overlay_share: 0."
+)
 
 
 def run(job: StageJob) -> None:
-    """Estimate the focal lengths that are not given; cameras that are given pass unchanged."""
+    """Estimate the focal lengths that are not given, and find what all images show at one place.
+
+    Cameras that are given pass unchanged.
+    """
     options: CalibrateCamerasOptions = job.options
     index = ImageIndex.read(job.path("index"))
     cameras = cameras_from_columns(
@@ -37,60 +49,108 @@ def run(job: StageJob) -> None:
     given = np.array([camera.source == "given" for camera in cameras], dtype=bool)
     sigmas = np.where(given, GIVEN_SIGMA, np.nan)
     counts = np.zeros(len(cameras), dtype=np.int32)
+    matched = _MatchedImages(job, index)
+    cells = np.zeros((0, 4), dtype=np.int32)
+    if options.overlay_share:
+        cells = find_overlay_cells(matched.of_one_size(OVERLAY_PAIRS), options.overlay_share)
     if options.estimate_focals and not given.all():
-        cameras, sigmas, counts = _calibrate(job, index, cameras, options)
+        cameras, sigmas, counts = _calibrate(job, index, cameras, matched, cells)
+    warnings = [OVERLAY.format(percent=100 * share) for share in covered_shares(cells).values()]
     models, sizes, params, sources = cameras_to_columns(cameras)
     CalibratedCameras(
-        np.array(models, dtype=object), sizes, params, np.array(sources, dtype=object), sigmas, counts
+        np.array(models, dtype=object),
+        sizes,
+        params,
+        np.array(sources, dtype=object),
+        sigmas,
+        counts,
+        cells,
+        np.array(warnings, dtype=object),
     ).write(job.output, job.header)
+    for line in warnings:
+        print(f"warning: {line}", flush=True)
     print(_summary(cameras), flush=True)
 
 
 def _calibrate(
-    job: StageJob, index: ImageIndex, cameras: list[Camera], options: "CalibrateCamerasOptions"
+    job: StageJob, index: ImageIndex, cameras: list[Camera], matched: "_MatchedImages", cells: Array
 ) -> tuple[list[Camera], Array, Array]:
     # not needed where all cameras are given
     from snakesfm.calibration.focal import MatchedPair, calibrate_focals, choose_pairs
 
+    options: CalibrateCamerasOptions = job.options
     given = np.array([camera.source == "given" for camera in cameras], dtype=bool)
-    candidates, places = _read_counts(job.paths("matches"))
     chosen = choose_pairs(
-        candidates[:, :2],
-        candidates[:, 2],
+        matched.pairs,
+        matched.counts,
         index.camera_ids,
         ~given,
         options.pairs_per_camera,
         options.min_matches,
     )
-    found, _ = gather_keypoints(job.paths("features"), set(candidates[chosen, :2].ravel().tolist()))
-    scales = detector_scales(index.sizes, job.settings)
-    keypoints = {image: reduce_keypoints(points, scales[image]) for image, points in found.items()}
     progress = job.progress(len(chosen), "pairs")
     pairs: dict[int, MatchedPair] = {}
-    by_file = sorted(chosen.tolist(), key=places.__getitem__)
-    for path, rows in groupby(by_file, key=lambda row: places[row][0]):
-        with PairMatches.open(path) as file:
-            columns, scores = file["matches"], file["scores"]
-            for row in rows:
-                i, j = candidates[row, :2].tolist()
-                progress.step()
-                if i not in keypoints or j not in keypoints:
-                    continue
-                part = slice(*places[row][1:])
-                # best first: the estimator draws from the first ones sooner
-                order = np.argsort(-scores[part], kind="stable")
-                matches = columns[part][order]
-                pairs[row] = MatchedPair(
-                    int(index.camera_ids[i]),
-                    int(index.camera_ids[j]),
-                    keypoints[i][matches[:, 0]],
-                    keypoints[j][matches[:, 1]],
-                    job.seed_for(str(index.names[i]), str(index.names[j])),
-                )
+    for row, first, second in matched.read(chosen):
+        i, j = matched.pairs[row].tolist()
+        moving = find_moving_matches(cells, matched.sizes[[i, j]], first, second)
+        pairs[row] = MatchedPair(
+            int(index.camera_ids[i]),
+            int(index.camera_ids[j]),
+            first[moving],
+            second[moving],
+            job.seed_for(str(index.names[i]), str(index.names[j])),
+        )
+        progress.step()
     # in the order of the pairs, not of the files
     ordered = [pairs[row] for row in sorted(pairs)]
     result = calibrate_focals(ordered, reduce_cameras(cameras, job.settings), options, job.threads)
     return restore_cameras(result.cameras, cameras, job.settings), result.sigmas, result.pair_counts
+
+
+class _MatchedImages:
+    """The matches of all pairs, read where they are asked for.
+
+    Attributes
+    ----------
+    pairs, counts : rows (i, j) of all pairs (P,2), sorted, and their matches (P,).
+    sizes : (N,2) width and height of the images in detector pixels.
+    """
+
+    def __init__(self, job: StageJob, index: ImageIndex) -> None:
+        table, self._places = _read_counts(job.paths("matches"))
+        self.pairs, self.counts = table[:, :2], table[:, 2]
+        self._features = job.paths("features")
+        self._scales = detector_scales(index.sizes, job.settings)
+        self.sizes = detector_sizes(index.sizes, job.settings)
+        self._keypoints: dict[int, Array] = {}
+
+    def read(self, rows: Array) -> Iterator[tuple[int, Array, Array]]:
+        """Some rows, file by file, and their matched keypoints (K,2) in detector pixels, best first."""
+        wanted = set(self.pairs[rows].ravel().tolist()) - self._keypoints.keys()
+        found, _ = gather_keypoints(self._features, wanted)
+        for image, points in found.items():
+            self._keypoints[image] = reduce_keypoints(points, self._scales[image])
+        by_file = sorted(rows.tolist(), key=self._places.__getitem__)
+        for path, of_file in groupby(by_file, key=lambda row: self._places[row][0]):
+            with PairMatches.open(path) as file:
+                columns, scores = file["matches"], file["scores"]
+                for row in of_file:
+                    i, j = self.pairs[row].tolist()
+                    if i not in self._keypoints or j not in self._keypoints:
+                        continue
+                    part = slice(*self._places[row][1:])
+                    # best first: the estimator draws from the first ones sooner
+                    order = np.argsort(-scores[part], kind="stable")
+                    matches = columns[part][order]
+                    yield row, self._keypoints[i][matches[:, 0]], self._keypoints[j][matches[:, 1]]
+
+    def of_one_size(self, most: int) -> Iterator[tuple[tuple[int, int], Array, Array]]:
+        """Up to so many pairs of images of one size, evenly drawn: the size and the keypoints."""
+        alike = np.flatnonzero((self.sizes[self.pairs[:, 0]] == self.sizes[self.pairs[:, 1]]).all(axis=1))
+        drawn = alike[np.linspace(0, len(alike) - 1, most).astype(int)] if len(alike) > most else alike
+        for row, first, second in self.read(drawn):
+            width, height = self.sizes[self.pairs[row, 0]].tolist()
+            yield (width, height), first, second
 
 
 def _read_counts(paths: Iterable[Path]) -> tuple[Array, list[tuple[Path, int, int]]]:

@@ -1,4 +1,4 @@
-"""Sum up every image of one block in a global descriptor."""
+"""Compute a global descriptor for every image of one block."""
 
 import math
 from pathlib import Path

@@ -14,7 +14,13 @@ from snakesfm.artifacts.images import CalibratedCameras, ImageIndex
 from snakesfm.artifacts.pairs import KINDS, REJECTIONS, PairMatches, TwoViewGeometries
 from snakesfm.errors import ArtifactError
 from snakesfm.geometry.camera import Camera, cameras_from_columns
-from snakesfm.geometry.detector_pixels import detector_scales, reduce_cameras, reduce_keypoints
+from snakesfm.geometry.detector_pixels import (
+    detector_scales,
+    detector_sizes,
+    reduce_cameras,
+    reduce_keypoints,
+)
+from snakesfm.matching.overlays import find_moving_matches
 from snakesfm.stages.job import StageJob
 from snakesfm.two_view.correspondences import first_rows_at_place, unify_matches
 from snakesfm.two_view.estimate import TwoViewEstimate, estimate_two_view_geometry
@@ -51,10 +57,14 @@ def run(job: StageJob) -> None:
     pairs: list[tuple[int, int]] = [(int(i), int(j)) for i, j in matches.pairs]
     cameras_of = [(of_camera[index.camera_ids[i]], of_camera[index.camera_ids[j]]) for i, j in pairs]
     seeds = [job.seed_for(str(index.names[i]), str(index.names[j])) for i, j in pairs]
+    sizes = detector_sizes(index.sizes, job.settings)
+    used = []
+    for k, (i, j) in enumerate(pairs):
+        best = _best_first(matches, k)
+        first, second = keypoints[i][best[:, 0]], keypoints[j][best[:, 1]]
+        used.append(best[find_moving_matches(cameras.overlay_cells, sizes[[i, j]], first, second)])
     digests = [
-        _digest(
-            _best_first(matches, k), (image_digests[i], image_digests[j]), cameras_of[k], options, seeds[k]
-        )
+        _digest(used[k], (image_digests[i], image_digests[j]), cameras_of[k], options, seeds[k])
         for k, (i, j) in enumerate(pairs)
     ]
     former = job.take_over(digests, _read_former)
@@ -67,7 +77,7 @@ def run(job: StageJob) -> None:
             estimate = estimate_two_view_geometry(
                 keypoints[i],
                 keypoints[j],
-                unify_matches(places[i], places[j], _best_first(matches, k)),
+                unify_matches(places[i], places[j], used[k]),
                 *cameras_of[k],
                 options,
                 seeds[k],

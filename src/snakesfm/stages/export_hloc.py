@@ -17,6 +17,11 @@ if TYPE_CHECKING:
 
 Array = NDArray[Any]
 
+SPACES = (
+    "Some image names contain spaces, at which hloc splits the lines of pairs.txt, so it cannot read this "
+    "file: rename these images if hloc is to read it."
+)
+
 COLUMNS = ("keypoints", "descriptors", "scores", "scales", "angles")
 
 
@@ -43,6 +48,9 @@ def run(job: StageJob) -> None:
             written += _write_tile(file, putative, verified, names, places, options.matches)
     with atomic_path(pairs) as temporary:
         temporary.write_text("".join(f"{names[i]} {names[j]}\n" for i, j in sorted(written)), "utf-8")
+    # hloc splits at any white space
+    if any(len(names[image].split()) > 1 for pair in written for image in pair):
+        job.warn(SPACES)
     print(f"{len(places)} images, {len(written)} pairs with {options.matches} matches")
 
 

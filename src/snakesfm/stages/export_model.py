@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from snakesfm.artifacts import ImageIndex, Reconstruction
+from snakesfm.artifacts import CalibratedCameras, ImageIndex, Reconstruction
 from snakesfm.export.colmap import (
     build_reconstruction,
     other_model_sizes,
@@ -137,6 +137,7 @@ def run(job: StageJob) -> None:
     if len(index.refused_names):
         warnings.append(REFUSED.format(count=len(index.refused_names), first=index.refused_reasons[0]))
     warnings += [str(line) for line in index.warnings]
+    warnings += [str(line) for line in CalibratedCameras.read(job.path("cameras")).warnings]
     if job.options.georeference is True and place is None:
         known = np.isfinite(index.gps[registered])
         told, flat = int(known.all(axis=1).sum()), int(known[:, :2].all(axis=1).sum())

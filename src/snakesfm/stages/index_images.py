@@ -1,4 +1,4 @@
-"""index_images: which images there are, and which cameras took them."""
+"""index_images: list the images and assign them to cameras."""
 
 from collections import Counter
 from collections.abc import Iterable

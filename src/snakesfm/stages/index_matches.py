@@ -1,4 +1,4 @@
-"""Express the matches of one tile, found without keypoints, in the merged keypoints of its images."""
+"""Assign the matches of one tile, found without keypoints, to the merged keypoints of its images."""
 
 import hashlib
 from typing import TYPE_CHECKING

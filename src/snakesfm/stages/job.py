@@ -1,4 +1,4 @@
-"""What a stage gets to work with, wherever it runs."""
+"""The inputs, outputs and options of a stage, wherever it runs."""
 
 import json
 import os
@@ -63,7 +63,6 @@ class StageJob:
     seed : the run's seed.
     threads : how many threads may be used; results never depend on it.
     former : an earlier version of the output whose unchanged parts may be taken over, or None.
-    upstream : per stage whose artifacts are read the digest of its version and options.
     batch_size : how many images or pairs a network gets at once; results never depend on it.
     """
 
@@ -76,7 +75,6 @@ class StageJob:
     seed: int = 0
     threads: int = 1
     former: Path | None = None
-    upstream: Mapping[str, str] = field(default_factory=dict)
     batch_size: int | Literal["auto"] = "auto"
 
     @property
@@ -159,6 +157,14 @@ class StageJob:
             if path is not None and os.path.isfile(path) and not wanted <= taken.keys():  # noqa: PTH113
                 taken.update(read(path, wanted))
         return taken
+
+    def warn(self, sentence: str) -> None:
+        """Say a warning in the log and on the terminal, where a stage's result has no place for it."""
+        sys.stderr.write(f"warning: {sentence}\n")
+        if Progress.terminal is not None:
+            print(
+                f"snakesfm: scene '{self.scene}': warning: {sentence}", file=Progress.terminal, flush=True
+            )
 
     def progress(self, total: int, what: str) -> "Progress":
         """A counter that prints how far the job is, at most every five seconds."""

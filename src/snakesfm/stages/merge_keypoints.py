@@ -1,4 +1,4 @@
-"""Merge the places that were matched in the images of one block into keypoints."""
+"""Merge the matched positions in the images of one block into keypoints."""
 
 import hashlib
 from collections.abc import Mapping

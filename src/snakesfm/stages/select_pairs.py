@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 Array = NDArray[Any]
 
-# how many pairs are looked at between two signs of progress: a second's work
+# how many pairs are previewed between two progress messages: about a second
 LOOKS_AT_ONCE = 2_000
 
 

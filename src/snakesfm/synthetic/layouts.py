@@ -1,4 +1,4 @@
-"""Where the cameras stand and what they look at; neighbouring cameras are about one unit apart."""
+"""Positions and viewing directions of cameras; neighbouring cameras are about one unit apart."""
 
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""Which images of a survey are matched, and what an estimation of their relative pose would give."""
+"""Which image pairs of a survey are matched, and the relative poses that would be estimated."""
 
 from dataclasses import dataclass
 from typing import Any

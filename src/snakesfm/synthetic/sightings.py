@@ -1,4 +1,4 @@
-"""What a feature detector finds in an image of a survey, without an image."""
+"""Simulated keypoints of the images of a survey, without rendering them."""
 
 import functools
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""What is simulated, and how the command line says so."""
+"""Options of the simulation, and its command line."""
 
 import argparse
 from collections.abc import Sequence

@@ -1,4 +1,4 @@
-"""Surveys of any size: where their cameras stand, and landmarks that are made cell by cell as needed.
+"""Surveys of any size: camera positions, and landmarks that are generated cell by cell as needed.
 
 Nothing grows with the size of a survey but the list of cameras: the landmarks of a cell follow from the
 seed and the cell's place alone.

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from snakesfm.grouping import components_of
 from snakesfm.tracks.split import cycle_support, split_conflicts, unconfirmed_links
 
 Array = NDArray[Any]
@@ -79,8 +80,8 @@ def build_tracks(
     nodes = np.flatnonzero(matched)
     links = (np.cumsum(matched) - 1)[links]
     images = (np.searchsorted(base, nodes, side="right") - 1).astype(np.int64)
-    parts = _components(links[~unconfirmed_links(links, images)], len(nodes))
-    labels = _components(links, len(nodes))
+    parts = components_of(len(nodes), links[~unconfirmed_links(links, images)])
+    labels = components_of(len(nodes), links)
     positions = np.concatenate(keypoints)[nodes] if len(nodes) else np.zeros((0, 2))
     in_conflict = _conflicting(labels, images, positions, merge_radius_px)
     conflicts = len(np.unique(labels[in_conflict]))
@@ -101,15 +102,6 @@ def build_tracks(
     sparse = np.bincount(images[long], minlength=len(keypoints)) < sparse_observations
     of_sparse = np.bincount(labels, weights=sparse[images])[labels] > 0
     return _assemble(labels, parts, images, rows, long | (of_sparse & (lengths >= 2)), conflicts)
-
-
-def _components(links: Array, count: int) -> Array:
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
-
-    ones = np.ones(len(links), dtype=np.int8)
-    graph = coo_matrix((ones, (links[:, 0], links[:, 1])), shape=(count, count))
-    return np.asarray(connected_components(graph, directed=False)[1], dtype=np.int64)
 
 
 def _conflicting(labels: Array, images: Array, positions: Array, merge_radius_px: float) -> Array:

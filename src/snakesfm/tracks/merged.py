@@ -1,4 +1,4 @@
-"""How much longer tracks get by merging what a detector-free matcher finds pair by pair."""
+"""Track lengths before and after merging the keypoints of a detector-free matcher."""
 
 from collections.abc import Callable
 from typing import Any
@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from snakesfm.grouping import components_of
 from snakesfm.matching.merging import MergedKeypoints
 
 Array = NDArray[Any]
@@ -63,15 +64,9 @@ def _ends(i: int, j: int, first: Array, second: Array) -> Array:
 
 
 def _lengths(ends: Array) -> Array:
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
-
     if len(ends) == 0:
         return np.zeros(0, np.int64)
     distinct, flat = np.unique(ends.reshape(-1, 3), axis=0, return_inverse=True)
-    links = flat.reshape(-1, 2)
-    shape = (len(distinct), len(distinct))
-    graph = coo_matrix((np.ones(len(links), np.int8), (links[:, 0], links[:, 1])), shape=shape)
-    labels = connected_components(graph, directed=False)[1]
+    labels = components_of(len(distinct), flat.reshape(-1, 2))
     seen = np.unique(np.column_stack([labels, distinct[:, 0].astype(np.int64)]), axis=0)[:, 0]
     return np.bincount(np.bincount(seen), minlength=3).astype(np.int64)

@@ -1,9 +1,11 @@
-"""Splitting of components at links that nothing confirms, and where they see an image twice."""
+"""Splitting of components at unconfirmed links, and where they contain two points of one image."""
 
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from snakesfm.grouping import components_of
 
 Array = NDArray[Any]
 
@@ -56,9 +58,6 @@ def unconfirmed_links(links: Array, images: Array) -> Array:
     -------
     (M,) bool.
     """
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
-
     if len(links) == 0:
         return np.zeros(0, dtype=bool)
     confirmed = cycle_support(links, len(images)) > 0
@@ -72,9 +71,7 @@ def unconfirmed_links(links: Array, images: Array) -> Array:
     pair_rule = np.bincount(pair_of, weights=excess, minlength=len(keys)) > 0
     image_rule = np.bincount(ends.ravel(), weights=np.repeat(excess, 2), minlength=count) > 0
     pairs = np.stack([keys // count, keys % count])
-    firm = pairs[:, pair_rule]
-    graph = coo_matrix((np.ones(firm.shape[1], dtype=np.int8), firm), shape=(count, count))
-    part = connected_components(graph, directed=False)[1]
+    part = components_of(count, pairs[:, pair_rule].T)
     rule = pair_rule | (image_rule[pairs].all(axis=0) & (part[pairs[0]] == part[pairs[1]]))
     return np.asarray(doubtful & rule[pair_of])
 

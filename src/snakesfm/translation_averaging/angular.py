@@ -7,7 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from snakesfm.geometry.sparse_systems import solve_spd
-from snakesfm.translation_averaging.landmarks import intersect, perpendicular, sum_by
+from snakesfm.grouping import sum_by
+from snakesfm.translation_averaging.landmarks import intersect, perpendicular
 from snakesfm.translation_averaging.problem import PositioningProblem
 
 Array = NDArray[Any]

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from snakesfm.grouping import components_of
 from snakesfm.translation_averaging.angular import refine_angles
 from snakesfm.translation_averaging.averagers import TranslationAverager, edge_angles_rad, with_rays
 from snakesfm.translation_averaging.landmarks import angles_rad, intersect
@@ -40,7 +41,7 @@ def average_components(
     edge_weight: float = 0.1,
     seed: int = 0,
 ) -> AveragedCenters:
-    """Position the cameras of each component (N,) of the images, -1 for none, in a world of its own."""
+    """Position the cameras of each component (N,) of the images, -1 for none, in its own frame."""
     centers = np.full((problem.image_count, 3), np.nan)
     edge_residuals = np.full(len(problem.pairs), np.nan)
     rays = []
@@ -111,15 +112,10 @@ def average_translations(
 
 def largest_part(problem: PositioningProblem) -> PositioningProblem:
     """The edges and rays of the largest set of images that edges or tracks connect."""
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
-
     tracks, track_node = np.unique(problem.ray_tracks, return_inverse=True)
     count = problem.image_count + len(tracks)
-    rows = np.concatenate([problem.pairs[:, 0], problem.ray_images])
-    cols = np.concatenate([problem.pairs[:, 1], problem.image_count + track_node])
-    graph = coo_matrix((np.ones(len(rows)), (rows, cols)), shape=(count, count))
-    labels = connected_components(graph, directed=False)[1][: problem.image_count]
+    seen = np.column_stack([problem.ray_images, problem.image_count + track_node])
+    labels = components_of(count, np.concatenate([problem.pairs, seen]))[: problem.image_count]
     main = labels == np.argmax(np.bincount(labels)) if problem.image_count else np.zeros(0, dtype=bool)
     return problem.select_edges(main[problem.pairs[:, 0]]).select_rays(main[problem.ray_images])
 

@@ -1,4 +1,4 @@
-"""The interchangeable methods: every one turns a problem into camera centres up to a similarity."""
+"""The interchangeable methods: each computes camera centres up to a similarity."""
 
 import math
 from dataclasses import dataclass

@@ -1,11 +1,11 @@
 """Landmarks of known cameras: which tracks to use, and where the landmarks are."""
 
-import math
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from snakesfm.grouping import sum_by
 from snakesfm.translation_averaging.problem import PositioningProblem
 
 Array = NDArray[Any]
@@ -36,20 +36,6 @@ def cover_cameras(ray_images: Array, ray_tracks: Array, image_count: int, rays_p
 def perpendicular(rays: Array) -> Array:
     """Projections (Q,3,3) onto the planes across unit vectors (Q,3)."""
     return np.asarray(np.eye(3) - rays[:, :, None] * rays[:, None, :])
-
-
-def sum_by(values: Array, groups: Array, count: int) -> Array:
-    """Sums (count, ...) of values (Q, ...) over the groups (Q) that they belong to, in their order.
-
-    By a sparse product, which reads many numbers per row in one pass: a pass for each takes several times
-    as long where they no longer fit the processor's caches.
-    """
-    from scipy.sparse import csc_array
-
-    flat = values.reshape(len(values), math.prod(values.shape[1:]))
-    ones, places = np.ones(len(groups)), np.arange(len(groups) + 1)
-    sums = csc_array((ones, groups, places), shape=(count, len(groups))) @ flat
-    return np.asarray(sums.reshape(count, *values.shape[1:]))
 
 
 def intersect(origins: Array, rays: Array, groups: Array, count: int, rounds: int = 5) -> Array:

@@ -6,7 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from snakesfm.geometry.colmap_binding import pycolmap
-from snakesfm.translation_averaging.landmarks import intersect, sum_by
+from snakesfm.grouping import sum_by
+from snakesfm.translation_averaging.landmarks import intersect
 from snakesfm.translation_averaging.problem import PositioningProblem
 
 Array = NDArray[Any]

@@ -1,4 +1,4 @@
-"""What a translation averager gets and gives."""
+"""The input of translation averagers."""
 
 from dataclasses import dataclass, replace
 from typing import Any

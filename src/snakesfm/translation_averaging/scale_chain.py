@@ -1,4 +1,4 @@
-"""First guess of the centres: baselines of the edges from shared landmarks, then linear least squares.
+"""Initial centres: baseline ratios of edges from shared landmarks, then linear least squares.
 
 After Cui and Tan, "Global Structure-from-Motion by Similarity Averaging" (ICCV 2015): the two cameras of an
 edge see a landmark at a depth that is known up to the edge's baseline; two edges that share a camera and a
@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from snakesfm.geometry.sparse_systems import solve_spd
+from snakesfm.grouping import components_of, sum_by
 from snakesfm.translation_averaging.clusters import join_clusters
-from snakesfm.translation_averaging.landmarks import sum_by
 from snakesfm.translation_averaging.problem import PositioningProblem
 
 Array = NDArray[Any]
@@ -159,15 +159,11 @@ def _comparable_parts(edges: Array, rows: Array, edge_count: int, row_count: int
     ----------
     edges, rows : (S,) edge and ray of each depth. A ray that one edge alone sees compares nothing.
     """
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
-
     several = np.flatnonzero(np.bincount(rows, minlength=row_count)[rows] > 1)
     if not len(several):
         return []
-    ends = (edges[several], edge_count + rows[several])
-    graph = coo_matrix((np.ones(len(several)), ends), shape=(edge_count + row_count,) * 2)
-    labels = connected_components(graph, directed=False)[1]
+    ends = np.column_stack([edges[several], edge_count + rows[several]])
+    labels = components_of(edge_count + row_count, ends)
     sizes = np.bincount(labels[np.unique(edges[several])])
     by_label = several[np.argsort(labels[edges[several]], kind="stable")]
     parts = np.split(by_label, np.flatnonzero(np.diff(labels[edges[by_label]])) + 1)
@@ -227,14 +223,12 @@ def _link(
 ) -> Array:
     """Centres (N,3) that differ by the edges' vectors, robustly; NaN off the largest connected part."""
     from scipy.sparse import coo_matrix, diags
-    from scipy.sparse.csgraph import connected_components
 
     count = problem.image_count
     centers = np.full((count, 3), np.nan)
     if len(taken) == 0:
         return centers
-    graph = coo_matrix((np.ones(len(taken)), problem.pairs[taken].T), shape=(count, count))
-    labels = connected_components(graph, directed=False)[1]
+    labels = components_of(count, problem.pairs[taken])
     main = labels == np.argmax(np.bincount(labels))
     taken = taken[main[problem.pairs[taken, 0]]]
     names, ends = np.unique(problem.pairs[taken], return_inverse=True)

@@ -1,4 +1,4 @@
-"""Which centres the measurements hold in place, and how well."""
+"""Test of which camera centres the measurements determine, and how well."""
 
 import math
 from dataclasses import dataclass
@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from snakesfm.grouping import sum_by
 from snakesfm.translation_averaging.averagers import edge_angles_rad
 from snakesfm.translation_averaging.landmarks import (
     angles_rad,
     intersect,
     perpendicular,
-    sum_by,
     usual_error_rad,
 )
 from snakesfm.translation_averaging.problem import PositioningProblem

@@ -1,4 +1,4 @@
-"""What a triangulator is given and gives back."""
+"""The interface of triangulators."""
 
 from dataclasses import dataclass
 from typing import Any, Protocol

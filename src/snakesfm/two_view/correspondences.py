@@ -1,4 +1,4 @@
-"""From matched keypoints to correspondences: duplicates, rays, and one match per place."""
+"""From matched keypoints to correspondences: duplicates, rays, and one match per position."""
 
 from typing import Any
 

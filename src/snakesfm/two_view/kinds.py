@@ -1,4 +1,4 @@
-"""Degenerate motions and scenes: a plane, and a camera that only turns."""
+"""Degenerate cases: a planar scene, and a camera that only rotates."""
 
 from typing import Any
 

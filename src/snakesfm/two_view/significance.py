@@ -1,4 +1,4 @@
-"""How unlikely it is that a relative pose agrees with as many matches by chance."""
+"""Significance of a relative pose: how unlikely it is that as many matches agree with it by chance."""
 
 from typing import Any
 

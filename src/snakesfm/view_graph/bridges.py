@@ -1,9 +1,11 @@
-"""Bridges of a view graph: edges on which alone the connection of two parts hangs."""
+"""Bridges of a view graph: edges that are the only connection between two parts."""
 
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from snakesfm.grouping import components_of
 
 Array = NDArray[Any]
 
@@ -24,14 +26,11 @@ def find_bridges(node_count: int, pairs: Array) -> Array:
     (E,) bool.
     """
     from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import breadth_first_order, connected_components
+    from scipy.sparse.csgraph import breadth_first_order
 
     pairs = np.asarray(pairs, dtype=np.int64).reshape(-1, 2)
     edge_count = len(pairs)
-    shape = (node_count, node_count)
-    graph = coo_array((np.ones(edge_count), (pairs[:, 0], pairs[:, 1])), shape=shape)
-    components = connected_components(graph, directed=False)[1]
-    roots = np.unique(components, return_index=True)[1]
+    roots = np.unique(components_of(node_count, pairs), return_index=True)[1]
     # a further node that is joined to every component makes the forest a tree
     heads = np.concatenate([pairs[:, 0], np.full(len(roots), node_count)])
     tails = np.concatenate([pairs[:, 1], roots])

@@ -1,4 +1,4 @@
-"""Clusters of images that cycles hold together, and the votes by which they are joined."""
+"""Clusters of images connected by cycles, and the votes by which they are joined."""
 
 from typing import Any
 

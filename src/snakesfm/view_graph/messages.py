@@ -1,4 +1,4 @@
-"""How wrong each edge is, from messages that its 3-cycles pass between their edges."""
+"""The error of each edge, from messages that its 3-cycles pass between their edges."""
 
 from typing import Any
 

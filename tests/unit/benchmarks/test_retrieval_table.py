@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from benchmarks.retrieval import BUDGETS, rank_pairs, recalls, render
+from snakesfm.retrieval.pairs import similarities_of
 
 
 def test_the_best_pairs_of_every_image_come_first():
@@ -13,6 +14,14 @@ def test_the_best_pairs_of_every_image_come_first():
     ranked = list(map(tuple, rank_pairs(similarities).tolist()))
     # first the best partner of each image, even of image 2, which resembles none well
     assert ranked == [(0, 1), (1, 3), (0, 2), (0, 3), (2, 3), (1, 2)]
+
+
+def test_an_image_without_features_is_in_no_pair():
+    vectors = np.array([[1, 0], [-1, 0], [0, 0], [0, 1]], np.float32)
+    ranked = rank_pairs(similarities_of(vectors, vectors))
+    assert sorted(map(tuple, ranked.tolist())) == [(0, 1), (0, 3), (1, 3)]
+    # the opposite one comes last
+    assert ranked[-1].tolist() == [0, 1]
 
 
 def test_recall_is_counted_within_the_budget():

@@ -39,4 +39,4 @@ def test_every_second_image_that_the_reference_has(data, tmp_path) -> None:
 
 def test_what_is_no_set_is_said(tmp_path, capsys) -> None:
     assert main([str(tmp_path), str(tmp_path / "thin"), "--sets", "nowhere"]) == 1
-    assert "nowhere is no image set" in capsys.readouterr().err
+    assert "nowhere is not an image set" in capsys.readouterr().err

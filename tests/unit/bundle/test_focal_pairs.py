@@ -9,10 +9,14 @@ from synthetic_scene import run_rounds, true_model
 
 from snakesfm.bundle.focal_pairs import (
     ONE_FOCAL_MODELS,
+    one_focal_serves,
     skewed_cameras,
     with_one_focal,
     with_two_focals,
 )
+from snakesfm.bundle.interface import SolverSettings
+from snakesfm.bundle.model import to_reconstruction
+from snakesfm.bundle.rounds import bundle_adjuster
 from snakesfm.geometry.camera import Camera
 from snakesfm.synthetic import layouts
 from snakesfm.synthetic.problems import make_problem
@@ -53,6 +57,17 @@ def test_only_focal_lengths_that_were_one_and_came_apart_are_tied():
         params = start.params if focals is None else (*focals, *start.params[2:])
         reconstruction.add_camera_with_trivial_rig(replace(start, params=params).to_pycolmap(row + 1))
     assert skewed_cameras(reconstruction, starts) == [2, 5]
+
+
+@pytest.mark.parametrize(("fy", "serves"), [(499.0, True), (485.0, False)])
+def test_one_focal_length_serves_where_errors_stay_as_they_are(fy, serves):
+    # square pixels raise the mean error from 0.77 px to 1.23 px
+    made = make_problem(12, 120, "area", noise_px=1.0, camera=camera_of("PINHOLE", 500.0, fy), seed=3)
+    reconstruction = to_reconstruction(true_model(made), made.keypoints, [f"{k}.jpg" for k in range(12)])
+    adjust = bundle_adjuster("ceres")
+    adjust(reconstruction, SolverSettings())
+    assert one_focal_serves(reconstruction, [1], adjust, SolverSettings()) == serves
+    assert reconstruction.camera(1).model_name == "PINHOLE"
 
 
 def upright_ring(camera_count, point_count, rng):

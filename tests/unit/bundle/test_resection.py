@@ -51,6 +51,12 @@ def test_a_camera_that_explains_the_matches_keeps_its_focal_length():
     assert found.camera.mean_focal_length() == 1.01 * TRUE_FOCAL and found.support >= 138
 
 
+@pytest.mark.parametrize(("factor", "focal"), [(1.1, 1.1 * TRUE_FOCAL), (1.12, TRUE_FOCAL)])
+def test_another_focal_length_must_explain_a_fifth_more_matches(factor, focal):
+    found = resect(guess(factor * TRUE_FOCAL), *seen_by_a_long_lens(), 3.0, 15_000.0, 0)
+    assert found.camera.mean_focal_length() == pytest.approx(focal, rel=0.0 if factor == 1.1 else 0.02)
+
+
 def test_without_a_longest_focal_length_the_cameras_stays():
     found = resect(guess(), *seen_by_a_long_lens(), 3.0, 0.0, 0)
     assert found.camera.mean_focal_length() == 900.0 and found.support < 110

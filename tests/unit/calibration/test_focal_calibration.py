@@ -126,6 +126,18 @@ def test_exif_is_joined_where_right_and_overruled_where_wrong(exif: float, withi
     assert abs(result.cameras[0].focal_px / 900 - 1) < within
 
 
+def test_exif_and_the_pairs_count_by_their_certainty() -> None:
+    pairs = [view_pair(300 + k, 900, 900) for k in range(8)]
+    alone = calibrate_focals(pairs, [camera(930.0)], OPTIONS)
+    joined = calibrate_focals(pairs, [camera(930.0, "exif")], OPTIONS)
+    weights = np.array([alone.sigmas[0], OPTIONS.exif_sigma]) ** -2.0
+    logs = np.log([alone.cameras[0].focal_px, 930.0])
+    # the certainties differ enough for the weights to tell
+    assert weights[1] / weights[0] > 1.5 and logs[1] - logs[0] > 0.02
+    assert np.log(joined.cameras[0].focal_px) == pytest.approx(np.average(logs, weights=weights), abs=1e-9)
+    assert joined.sigmas[0] == pytest.approx(weights.sum() ** -0.5)
+
+
 def test_one_pair_tells_more_than_a_default_but_not_than_exif() -> None:
     pairs = [view_pair(301, 900, 900)]
     guessed = calibrate_focals(pairs, [camera(1200.0)], OPTIONS)
@@ -133,6 +145,16 @@ def test_one_pair_tells_more_than_a_default_but_not_than_exif() -> None:
     assert 0.03 < guessed.sigmas[0] < OPTIONS.max_sigma and guessed.pair_counts.tolist() == [1]
     exif = calibrate_focals(pairs, [camera(1200.0, "exif")], OPTIONS)
     assert exif.cameras == [camera(1200.0, "exif")]
+
+
+@pytest.mark.parametrize(
+    ("guess", "bounds"), [(700.0, {"max_focal_ratio": 0.8}), (1100.0, {"min_focal_ratio": 1.0})]
+)
+def test_a_focal_length_out_of_bounds_is_not_believed(guess: float, bounds: dict[str, float]) -> None:
+    pairs = [view_pair(300 + k, 900, 900) for k in range(8)]
+    result = calibrate_focals(pairs, [camera(guess)], CalibrateCamerasOptions(**bounds))
+    assert result.cameras == [camera(guess)]
+    assert calibrate_focals(pairs, [camera(guess)], OPTIONS).cameras[0].source == "estimated"
 
 
 def test_without_pairs_priors_stay() -> None:
@@ -163,13 +185,26 @@ def test_chosen_pairs_are_strong_bounded_and_spread() -> None:
     assert 100 <= len(own) <= 200
 
 
-def epipolar_pairs(focal: float, count: int) -> list[EpipolarPair]:
-    pairs = [view_pair(400 + k, focal, focal) for k in range(count)]
+def epipolar_pairs(focal: float, count: int, noise_px: float = 0.3) -> list[EpipolarPair]:
+    pairs = [view_pair(400 + k, focal, focal, noise_px=noise_px) for k in range(count)]
     found = [
         estimate_epipolar_pair(0, 0, p.points_i - CENTER, p.points_j - CENTER, 1.0, 0.8, p.seed)
         for p in pairs
     ]
     return [pair for pair in found if pair is not None]
+
+
+def test_strongest_pairs_are_chosen_first() -> None:
+    pairs, counts = np.array([[0, 1], [0, 2], [0, 3], [0, 4]]), np.array([50, 500, 100, 60])
+    assert choose_pairs(pairs, counts, np.zeros(5, dtype=int), np.array([True]), 1, 40).tolist() == [1]
+
+
+def test_no_pair_is_trusted_beyond_two_percent() -> None:
+    pairs = epipolar_pairs(900.0, 6, noise_px=0.05)
+    one = np.array([900.0])
+    sigma = adjust_focals(pairs, one, np.array([True]), one, np.array([0.5])).sigmas[0]
+    # six pairs of 2 % each
+    assert len(pairs) == 6 and 0.008 < sigma < 0.02
 
 
 @pytest.mark.parametrize("count", [1, 255, 256, 600])

@@ -10,7 +10,7 @@ from snakesfm.errors import ConfigError
 from snakesfm.evaluation.__main__ import main
 from snakesfm.evaluation.alignment import align_poses
 from snakesfm.evaluation.colmap_model import find_model, model_poses, read_model
-from snakesfm.evaluation.metrics import Poses, evaluate_poses, model_metrics
+from snakesfm.evaluation.metrics import Poses, _distribution, evaluate_poses, model_metrics
 from snakesfm.evaluation.pose_errors import (
     chordal_angle_deg,
     compared_images,
@@ -227,6 +227,21 @@ def test_known_noise_gives_known_errors() -> None:
     assert 1.2 < metrics["relative_rotation_error_deg_median"] < 1.6
     assert metrics["position_error_max"] < 0.2
     assert 40.0 < metrics["pose_auc_2.5deg"] < 70.0
+
+
+def test_distribution_names_its_upper_end() -> None:
+    assert _distribution("x", np.arange(11.0)) == {"x_median": 5, "x_mean": 5, "x_p90": 9, "x_max": 10}
+
+
+def test_position_errors_are_percent_of_the_references_extent() -> None:
+    rotations, _ = random_poses(4)
+    centers = np.array([[0.0, 0, 0], [10.0, 0, 0], [0.0, 2, 0], [10.0, 2, 0]])
+    shifted = centers + np.array([[0.0, 0, 0.1], [0, 0, 0], [0, 0, 0], [0, 0, 0]])
+    metrics = evaluate_poses(named(rotations, shifted), named(rotations, centers)).metrics
+    assert 0.5 < metrics["position_error_percent_max"] < 1.1
+    assert metrics["position_error_percent_max"] == pytest.approx(
+        100.0 * metrics["position_error_max"] / metrics["reference_extent"]
+    )
 
 
 def test_names_match_by_path_and_else_by_a_unique_file_name() -> None:

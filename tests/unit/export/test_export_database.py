@@ -18,7 +18,9 @@ from snakesfm.config.export_database import ExportDatabaseOptions
 from snakesfm.errors import ArtifactError
 from snakesfm.evaluation.colmap_model import model_poses
 from snakesfm.evaluation.metrics import Poses, evaluate_poses
+from snakesfm.export.database import panoramic_geometry
 from snakesfm.geometry.camera import Camera, cameras_to_columns
+from snakesfm.geometry.rotations import exp_so3
 from snakesfm.stages import export_database
 from snakesfm.stages.job import StageJob
 from snakesfm.synthetic.problems import SyntheticProblem, make_problem
@@ -64,9 +66,9 @@ def write_inputs(folder: Path, problem: SyntheticProblem) -> dict[str, str | lis
         refused_reasons=[],
         warnings=[],
     ).write(folder / "index.h5", HEADER)
-    CalibratedCameras(models, sizes, params, sources, np.zeros(2), np.zeros(2, np.int32)).write(
-        folder / "cameras.h5", HEADER
-    )
+    CalibratedCameras(
+        models, sizes, params, sources, np.zeros(2), np.zeros(2, np.int32), np.zeros((0, 4), int), []
+    ).write(folder / "cameras.h5", HEADER)
     for block in (0, 1):
         images = np.arange(block, COUNT, 2)
         counts = [len(problem.keypoints[image]) for image in images]
@@ -205,6 +207,20 @@ def test_matches_of_all_pairs_and_geometries_of_accepted_ones(database, problem:
         left = np.cross(np.eye(3), pose.translation) @ geometry.E
         assert np.abs(np.trace(left)) > 0.1
         assert np.abs(pose.translation @ geometry.E).max() < 1e-9
+
+
+def test_homography_takes_the_first_cameras_pixels_to_the_second() -> None:
+    first, second = CAMERAS[0], Camera("SIMPLE_RADIAL", *SIZE, (700.0, 300.0, 250.0, 0.0))
+    turn = exp_so3(np.array([0.05, -0.2, 0.1]))
+    inliers = np.array([[0, 1], [2, 0]])
+    geometry = panoramic_geometry(turn, inliers, (first, second))
+    rays = np.array([[0.1, -0.2, 1.0], [-0.3, 0.05, 1.0], [0.0, 0.3, 1.0]])
+    pixels = np.column_stack([first.to_pycolmap().img_from_cam(rays), np.ones(3)])
+    found = pixels @ geometry.H.T
+    np.testing.assert_allclose(
+        found[:, :2] / found[:, 2:], second.to_pycolmap().img_from_cam(rays @ turn.T), atol=1e-9
+    )
+    np.testing.assert_array_equal(geometry.inlier_matches, inliers)
 
 
 def test_global_mapping_takes_the_database_as_it_is(

@@ -15,6 +15,7 @@ import pytest
 from PIL import Image
 
 from snakesfm.artifacts import (
+    CalibratedCameras,
     CameraRotations,
     Header,
     ImageIndex,
@@ -38,6 +39,7 @@ from snakesfm.synthetic.problems import SyntheticProblem, make_problem
 
 COUNT = 9
 LOST = 8
+OVERLAY = "5.0 % of the images of a size show the same."
 ORIENTATION = 0x0112
 FILES = (
     "sparse/0/cameras.bin",
@@ -86,6 +88,14 @@ def write_index(
         warnings=["5 images have a camera each."],
     ).write(folder / "index.h5", HEADER)
     return folder / "index.h5"
+
+
+def write_cameras(folder: Path) -> Path:
+    models, sizes, params, sources = cameras_to_columns([CAMERA, CAMERA])
+    CalibratedCameras(
+        models, sizes, params, sources, np.zeros(2), np.zeros(2, int), np.zeros((0, 4), int), [OVERLAY]
+    ).write(folder / "cameras.h5", HEADER)
+    return folder / "cameras.h5"
 
 
 def write_reconstruction(
@@ -147,6 +157,7 @@ def export(
 ) -> Path:
     inputs = {
         "index": str(write_index(tmp_path, orientations, gps)),
+        "cameras": str(write_cameras(tmp_path)),
         "reconstruction": str(write_reconstruction(tmp_path, problem, lost, reset, offset)),
     }
     folder = tmp_path / "out" / "scene" / "export_model"
@@ -236,8 +247,8 @@ def test_summary_says_what_is_there_and_what_is_missing(tmp_path, problem) -> No
     assert summary["points"] == len(problem.points)
     assert 0.1 < summary["mean_reprojection_error_px"] < 0.5
     assert summary["mean_track_length"] == pytest.approx(summary["observations"] / summary["points"])
-    spaces, refused, doubted = summary["warnings"]
-    assert doubted == "5 images have a camera each."
+    spaces, refused, doubted, overlay = summary["warnings"]
+    assert (doubted, overlay) == ("5 images have a camera each.", OVERLAY)
     assert "spaces" in spaces
     assert refused == "1 image files could not be used (all in the report): It is a text file."
 

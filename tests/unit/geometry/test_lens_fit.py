@@ -43,3 +43,15 @@ def test_few_images_or_observations_tell_nothing() -> None:
     assert fit_of(TRUE, images=4) == {}
     assert fit_of(TRUE, count=499) == {}
     assert set(fit_of(TRUE, count=500, images=5)) == {4}
+
+
+def test_errors_along_the_radius_are_no_noise() -> None:
+    camera = Camera("PINHOLE", 1000, 800, (900.0, 900.0, 500.0, 400.0))
+    rng = np.random.default_rng(0)
+    pixels = rng.uniform((50.0, 40.0), (950.0, 760.0), (COUNT, 2))
+    in_camera = np.column_stack([camera.normalize(pixels), np.ones(COUNT)])
+    outward = (pixels - [500.0, 400.0]) / np.hypot(*(pixels - [500.0, 400.0]).T)[:, None]
+    seen = pixels + 2.0 * outward + rng.normal(0.0, 0.2, pixels.shape)
+    fit = fit_lenses({1: camera}, np.full(COUNT, 1), np.arange(COUNT) % 10, in_camera, seen)[1]
+    assert 0.18 < fit.noise_px < 0.22
+    assert 9.0 < fit.misfit < 11.0

@@ -90,6 +90,8 @@ def test_sensor_database():
         (Exif("", "", focal_35mm=35), (4000, 3000), 35 * 1.25 / math.hypot(36, 24)),
         # digital zoom, or the longer lens of a telephone
         (Exif("NIKON", "NIKON D750", focal_mm=50, focal_35mm=100), (6000, 4000), 100 / 36),
+        (Exif("NIKON", "NIKON D750", focal_mm=50, focal_35mm=65), (6000, 4000), 65 / 36),
+        (Exif("NIKON", "NIKON D750", focal_mm=50, focal_35mm=53), (6000, 4000), 50 / 35.9),
         # an equivalent that merely repeats the focal length
         (Exif("DJI", "FC6310", focal_mm=8.8, focal_35mm=9), (5472, 3648), 8.8 / 13.2),
     ],

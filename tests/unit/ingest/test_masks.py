@@ -39,3 +39,9 @@ def test_masks_of_floating_point_numbers_are_black_at_0_and_where_nothing_is(tmp
     Image.fromarray(stored).save(tmp_path / "mask.png", format="TIFF")
     wanted = read_mask(tmp_path / "mask.png", (WIDTH, HEIGHT))
     assert wanted[20:40].all() and not wanted[:20].any() and not wanted[40:].any()
+
+
+def test_the_darkest_gray_is_wanted(tmp_path) -> None:
+    gray = np.tile(np.arange(WIDTH) % 2, (HEIGHT, 1)).astype(np.uint8)
+    Image.fromarray(gray).save(tmp_path / "mask.png")
+    np.testing.assert_array_equal(read_mask(tmp_path / "mask.png", (WIDTH, HEIGHT)), gray == 1)

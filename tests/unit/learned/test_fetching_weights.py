@@ -47,7 +47,7 @@ def test_a_file_is_fetched_once_and_its_sum_recorded(monkeypatch, source, folder
     assert read_sums(folder) == {"net.bin": SUM}
     source.unlink()
     (line,) = fetch_weights(["net"], folder)
-    assert "is there" in line
+    assert "is already there" in line
     assert sorted(path.name for path in folder.iterdir()) == ["SHA256SUMS", "net.bin"]
 
 

@@ -102,6 +102,36 @@ def test_images_without_features_resemble_none():
     vectors[2] = 0
     table = similar_pairs([np.arange(6)], lambda block: vectors, 5, -1.0)
     assert 2 not in table.pairs
+    # nor do they take the place of one that has
+    assert len(table.pairs) == 5 * 4 / 2
+
+
+def test_images_choose_partners_of_negative_similarity():
+    # three directions of a plane: all dot products but an image's own are -1/2
+    angles = 2 * np.pi * np.arange(3) / 3
+    vectors = np.column_stack([np.cos(angles), np.sin(angles), np.zeros(3)])
+    vectors = round_units(np.vstack([vectors, np.zeros(3), [0, 0, 1], [0, 0, -1]]))
+    both_blocks = [np.arange(3), np.arange(3, 6)]
+
+    def pairs(top_k, min_score):
+        table = similar_pairs(both_blocks, lambda block: vectors[both_blocks[block]], top_k, min_score)
+        return table.pairs.tolist()
+
+    plane = [[0, 1], [0, 2], [1, 2]]
+    across = [[i, j] for i in range(3) for j in (4, 5)]
+    assert pairs(5, -1.0) == sorted([*plane, *across, [4, 5]])
+    assert pairs(5, -0.75) == sorted([*plane, *across])
+    assert pairs(5, 0.0) == across
+    # the most similar come first, whatever their sign, and image 3 has nothing
+    assert pairs(1, -1.0) == [[0, 4], [0, 5], [1, 4], [2, 4]]
+
+
+def test_opposite_descriptors_are_no_less_than_the_least_similarity():
+    # a vocabulary learned on two images puts their residuals on opposite sides
+    vector = np.array([0.5004, 0.5004, 0.5, 0.5])
+    vectors = round_units(np.vstack([vector, -vector]))
+    assert (vectors @ vectors.T)[0, 1] < -1
+    assert similar_pairs([np.arange(2)], lambda block: vectors, 1, -1.0).pairs.tolist() == [[0, 1]]
 
 
 def test_union_joins_reasons_and_keeps_similarities():

@@ -245,3 +245,20 @@ def test_networks_are_averaged_nearly_as_well_as_without_outliers(outliers):
         errors.append(np.degrees(angle_of(gauge @ Rotation.from_matrix(gauge).mean().as_matrix().T)).mean())
     assert 0.02 < errors[1] < 0.5
     assert 0.9 * errors[1] < errors[0] < 1.4 * errors[1]
+
+
+def test_axes_of_covariances_are_those_of_the_second_camera():
+    pairs, exact, truth = random_graph(30, 200, 0)
+    rng = np.random.default_rng(50)
+    axes = Rotation.random(len(pairs), rng).as_matrix()
+    sigmas = np.radians([0.1, 0.1, 2.0])
+    noise = np.einsum("eij,ej->ei", axes, rng.normal(size=(len(pairs), 3)) * sigmas)
+    along = axes @ np.diag(sigmas**2) @ axes.transpose(0, 2, 1)
+    alike = np.tile(np.mean(sigmas**2) * np.eye(3), (len(pairs), 1, 1))
+    errors = []
+    for covariances in (along, alike):
+        averaged = TwoStageAverager().average(30, pairs, exp_so3(noise) @ exact, None, covariances)
+        gauge = averaged.transpose(0, 2, 1) @ truth
+        mean = Rotation.from_matrix(gauge).mean().as_matrix()
+        errors.append(np.degrees(np.sqrt(np.mean(angle_of(gauge @ mean.T) ** 2))))
+    assert 0.03 < errors[0] < 0.35 * errors[1]

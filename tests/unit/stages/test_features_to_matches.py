@@ -398,6 +398,23 @@ def test_other_options_or_a_damaged_former_file_take_nothing_over(dealt, images,
     assert all(len(points["keypoints"]) <= 400 for points in other.features().values())
 
 
+def newer(kind, **options):
+    """The options of a version to come."""
+    return type("Newer", (kind,), {"stage_version": 999})(**options)
+
+
+def test_features_and_matches_of_another_version_are_not_taken_over(dealt, images, tmp_path):
+    scene = Scene(tmp_path, images, 3)
+    scene.extract(newer(ExtractFeaturesOptions, max_keypoints=400), former=dealt)
+    for before, after in zip(dealt.block_files("features"), scene.block_files("features"), strict=True):
+        former, digests = (set(LocalFeatures.read(path).digests) for path in (before, after))
+        assert len(former) == len(digests) > 0 and former.isdisjoint(digests)
+    dealt.select(SelectPairsOptions(method="sequential", preview_keypoints=0, look_ahead=1))
+    matches = (dealt.match(), dealt.match(newer(MatchPairsOptions), former=dealt))
+    former, digests = ({row[2] for row in found.values()} for found in matches)
+    assert len(former) == len(digests) == 5 and former.isdisjoint(digests)
+
+
 def test_an_empty_scene_gives_valid_files(tmp_path, images):
     scene = Scene(tmp_path, images, 40)
     empty = next(block for block in range(40) if block not in deal_blocks(NAMES, 40))

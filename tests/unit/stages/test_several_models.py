@@ -143,6 +143,19 @@ def test_a_part_is_given_its_own_images_and_those_tied_to_it(made, scene, tmp_pa
         assert rotation_errors_deg(model.rotations[part], made.rotations[part]).max() < 0.5
 
 
+def test_a_camera_that_parts_share_is_held_in_the_second(scene, tmp_path, monkeypatch):
+    held = []
+
+    def adjust_rounds(reconstruction, read_graph, cameras, solving, *arguments):
+        held.append(solving.constant_cameras)
+        return rounds.adjust_rounds(reconstruction, read_graph, cameras, solving, *arguments)
+
+    monkeypatch.setattr(adjust_bundle, "adjust_rounds", adjust_rounds)
+    options = AdjustBundleOptions(refine_keypoints=False, thresholds_px=(4.0,), max_iterations=5)
+    run(adjust_bundle, options, scene, tmp_path / "model.h5", intrinsics="refine", images="")
+    assert held == [frozenset(), frozenset([1])]
+
+
 def test_images_are_tied_by_chains_of_pairs():
     pairs = np.array([[0, 3], [3, 5], [1, 2], [4, 6]])
     posed = np.isin(np.arange(8), [0, 6])

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from synthetic_scene import HEADER, write_scene
+from synthetic_scene import HEADER, write_features, write_geometries, write_scene
 
 from snakesfm.artifacts import (
     CalibratedCameras,
@@ -170,6 +170,34 @@ def test_refused_edges_make_no_tracks(inputs):
     options = BuildTracksOptions(sparse_observations=0)
     with pytest.raises(SceneError, match=kept.format(3) + r" or lower build_tracks\.min_length\.$"):
         run(build_tracks, options, inputs, inputs["tracks"])
+
+
+def test_edges_that_the_averaged_rotations_contradict_make_no_tracks(inputs):
+    averaged = CameraRotations.read(inputs["rotations"])
+    replace(averaged, labels=np.ones(len(averaged.labels), np.int8)).write(inputs["rotations"], HEADER)
+    with pytest.raises(SceneError, match="along the 0 kept image pairs"):
+        run(build_tracks, BuildTracksOptions(), inputs, inputs["tracks"])
+
+
+@pytest.mark.parametrize(("settings", "merged"), [({}, False), ({"detector_shorter_side_px": 240}, True)])
+def test_keypoints_are_merged_within_detector_pixels(made, inputs, tmp_path, capsys, settings, merged):
+    # the first image's keypoints of one pair lie 1.5 px beside those of its other pairs
+    row = np.flatnonzero((made.pairs[:, 0] == 0) & (made.pairs[:, 1] != 5))[1]
+    own, matches = made.keypoints[0], made.matches.copy()
+    matches[made.match_offsets[row] : made.match_offsets[row + 1], 0] += len(own)
+    beside = np.concatenate([own, own + np.float32([1.5, 0.0])])
+    doubled = replace(made, keypoints=(beside, *made.keypoints[1:]), matches=matches)
+    inputs |= {
+        "features": write_features(doubled, tmp_path),
+        "geometries": write_geometries(doubled, tmp_path),
+    }
+    run(build_tracks, BuildTracksOptions(), inputs, inputs["tracks"], **settings)
+    conflicts = int(capsys.readouterr().out.split("; ")[1].split()[0])
+    assert (
+        conflicts == 0
+        if merged
+        else 10 < conflicts <= made.match_offsets[row + 1] - made.match_offsets[row]
+    )
 
 
 def test_where_every_track_sees_an_image_twice_splitting_is_advised(inputs):

@@ -142,6 +142,24 @@ def test_near_keypoints_of_one_image_are_one_observation():
     assert as_sets(apart) == [] and apart.conflicts == 1
 
 
+@pytest.mark.parametrize("best", [0, 1])
+def test_the_better_linked_of_near_keypoints_is_the_observation(best):
+    keypoints = [np.array([[10, 10], [10.3, 10]], np.float32), *spread_keypoints(3, 1)]
+    pairs = [(0, 1), (0, 2), (1, 2), (1, 3), (2, 3)]
+    table = {pair: [(best if pair[0] == 0 else 0, 0)] for pair in pairs} | {(0, 3): [(1 - best, 0)]}
+    tracks = build_tracks(keypoints, *matches_of(table))
+    assert as_sets(tracks) == [[(0, best), (1, 0), (2, 0), (3, 0)]]
+
+
+@pytest.mark.parametrize(
+    ("strengths", "labels"), [([[1, 0], [0, 9]], [0, 1, 0]), ([[0, 9], [1, 0]], [0, 1, 1])]
+)
+def test_first_column_of_strengths_decides(strengths, labels):
+    links, images = np.array([[0, 2], [1, 2]]), np.array([0, 0, 1])
+    positions = np.array([[0.0, 0.0], [50.0, 50.0], [5.0, 5.0]])
+    assert split_conflicts(links, np.array(strengths), images, positions, 1.0).tolist() == labels
+
+
 def test_cycle_support_counts_triangles():
     links = np.array([(0, 1), (1, 2), (0, 2), (2, 3)])
     np.testing.assert_array_equal(cycle_support(links, 4), [1, 1, 1, 0])

@@ -16,7 +16,12 @@ from snakesfm.translation_averaging.averagers import (
     with_rays,
 )
 from snakesfm.translation_averaging.landmarks import cover_cameras, intersect
-from snakesfm.translation_averaging.problem import PositioningProblem, edge_directions, world_rays
+from snakesfm.translation_averaging.problem import (
+    PositioningProblem,
+    direction_sigmas,
+    edge_directions,
+    world_rays,
+)
 from snakesfm.translation_averaging.recovery import mfas_weights
 from snakesfm.translation_averaging.scale_chain import chain_centers, refine_directions, shared_rays
 from snakesfm.translation_averaging.support import SupportLimits, held_cameras
@@ -54,6 +59,11 @@ def test_directions_point_from_camera_i_to_camera_j():
     assert angle_between(directions, baselines).max() < 1e-7
 
 
+def test_deviation_of_a_direction_is_that_of_its_tangents():
+    covariances = np.stack([np.diag([1e-6, 1e-6, 1e-6, 4e-4, 16e-4]), np.full((5, 5), np.nan)])
+    assert direction_sigmas(covariances) == pytest.approx([np.sqrt(1e-3), np.radians(5.0)])
+
+
 def test_rays_point_at_the_points():
     truth = make_problem(10, 300, "ring", noise_px=0.0)
     problem = positioning(truth)
@@ -86,6 +96,15 @@ def test_intersect_ignores_a_wrong_line_and_flags_parallel_ones():
     assert np.linalg.norm(points[0] - target) < 0.01
     assert np.isnan(points[1]).all()
     assert np.isnan(points[2]).all()
+
+
+def test_lines_that_meet_ahead_outweigh_more_that_meet_behind():
+    ahead, behind = np.array([0.0, 0.0, 4.0]), np.array([0.5, 0.2, -4.0])
+    origins = np.array([[-1.0, 0, 0], [1, 0, 0], [0, -1, 0], [0, 1, 0], [0.5, 0.5, 0]])
+    rays = np.concatenate([ahead - origins[:2], origins[2:] - behind])
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    (point,) = intersect(origins, rays, np.zeros(5, dtype=int), 1, rounds=20)
+    assert np.linalg.norm(point - ahead) < 0.05
 
 
 def test_shared_rays_lists_each_common_track_of_each_edge():
@@ -163,6 +182,21 @@ def test_a_cluster_stays_out_where_edges_do_not_tell_its_scale(edges_between):
     assert errors(centers, truth.centers).max() < 0.005 * np.linalg.norm(np.ptp(truth.centers, axis=0))
 
 
+@pytest.mark.parametrize(("directions", "count"), [("true", 10), ("random", 0), ("negated", 0)])
+def test_a_cluster_stays_out_where_edges_contradict_each_other_or_its_direction(directions, count):
+    _, problem, second = two_clusters(slice(None))
+    across = second[problem.pairs[:, 0]] != second[problem.pairs[:, 1]]
+    others = problem.directions.copy()
+    if directions == "random":
+        others[across] = np.random.default_rng(1).normal(size=(across.sum(), 3))
+        others /= np.linalg.norm(others, axis=1, keepdims=True)
+    elif directions == "negated":
+        others[across] *= -1.0
+    centers = chain_centers(dataclasses.replace(problem, directions=others), np.radians(0.45))
+    assert np.isfinite(centers[~second]).all()
+    assert np.isfinite(centers[second, 0]).sum() == count
+
+
 def test_a_camera_without_telling_landmarks_is_held_by_its_edges():
     truth = make_problem(20, 1500, "area", noise_px=0.3, seed=1)
     problem = positioning(truth)
@@ -178,6 +212,21 @@ def test_a_camera_without_telling_landmarks_is_held_by_its_edges():
     two = unlinked.select_rays(pair)
     assert np.count_nonzero(two.ray_images == 19) > LIMITS.min_support
     assert not held_cameras(two, truth.centers, truth.points, LIMITS)[19]
+
+
+@pytest.mark.parametrize("scale", [1e-3, 1.0, 1e3])
+def test_whether_a_camera_is_held_does_not_depend_on_the_scale(scale):
+    truth = make_problem(12, 600, "area", noise_px=0.3, rotation_noise_deg=0.05, seed=3)
+    problem = positioning(truth)
+    problem = problem.select_edges((problem.pairs != 4).all(axis=1))
+    mine = problem.ray_images == 4
+    narrow = np.degrees(angle_between(problem.rays, problem.rays[mine].mean(axis=0))) < 8.0
+    limits = SupportLimits(max_relative_sigma=0.01)
+    for rays, kept in ((np.ones_like(mine), True), (~mine | narrow, False)):
+        some = problem.select_rays(rays)
+        assert np.count_nonzero(some.ray_images == 4) > limits.min_support
+        held = held_cameras(some, scale * truth.centers, scale * truth.points, limits)
+        np.testing.assert_array_equal(held, kept | (np.arange(12) != 4))
 
 
 def test_refinement_improves_a_disturbed_start_and_keeps_missing_cameras():
@@ -240,6 +289,14 @@ def test_whole_averaging_with_noise_and_outliers(layout):
     assert np.degrees(np.median(good)) < 3.0
     assert np.degrees(np.median(result.ray_residuals_rad)) < 0.2
     assert len(result.ray_tracks) == len(result.ray_residuals_rad)
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_scale_chain_withstands_a_third_of_wrong_pairs(seed):
+    truth = make_problem(30, 1500, "area", 0.7, 0.1, 0.3, 0.35, seed=seed)
+    found = errors(ScaleChain().position(positioning(truth), 0), truth.centers)
+    assert len(found) == 30
+    assert 1e-4 < np.median(found) < 0.004 and found.max() < 0.04
 
 
 def test_weak_camera_is_not_thrown_away():
@@ -341,6 +398,13 @@ def test_numbers_of_tracks_cost_nothing_and_change_nothing(averager, tolerance):
     np.testing.assert_allclose(many.ray_residuals_rad, few.ray_residuals_rad, rtol=0.0, atol=tolerance)
     np.testing.assert_array_equal(many.ray_tracks, few.ray_tracks * 10**9 + 10**12)
     assert np.isfinite(few.centers).all() and len(few.ray_tracks) > 500
+
+
+def test_loss_scale_of_global_positioning_says_which_rays_count():
+    truth = make_problem(8, 150, "area", noise_px=0.5, outlier_ratio=0.1, seed=3)
+    robust, plain = (GlobalPositioning(loss_scale=scale, start="chain") for scale in (1e-3, 10.0))
+    found = [errors(a.position(positioning(truth), 0), truth.centers) for a in (robust, plain)]
+    assert 1e-4 < np.median(found[0]) < 0.1 * np.median(found[1])
 
 
 def test_cameras_at_one_scale_are_those_whose_baselines_agree():

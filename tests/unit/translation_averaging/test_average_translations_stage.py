@@ -48,6 +48,8 @@ def write_inputs(folder, truth, rotations, kinds=None, labels=None):
         sources=sources,
         focal_sigma=np.zeros(1),
         pair_counts=np.zeros(1, np.int32),
+        overlay_cells=np.zeros((0, 4), np.int32),
+        warnings=np.zeros(0, dtype=object),
     )
     graph = ViewGraph(
         pairs=truth.pairs,

@@ -81,3 +81,10 @@ def test_hypotheses_are_all_pairs_or_as_many_of_them_as_wanted(length):
     if len(everything) > 100:
         # from everywhere, not from the front
         assert pairs.max() > 0.7 * length and 0.5 * length < pairs[:, 1].mean() < 0.85 * length
+
+
+def test_chosen_hypotheses_follow_the_seed():
+    limits = TriangulationLimits(4.0, 1.0)
+    pairs = hypotheses_of(30, limits)
+    np.testing.assert_array_equal(hypotheses_of(30, limits), pairs)
+    assert not np.array_equal(hypotheses_of(30, TriangulationLimits(4.0, 1.0, seed=1)), pairs)

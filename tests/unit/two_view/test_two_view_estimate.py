@@ -1,6 +1,7 @@
 """The two-view geometry of a pair: pose, kind, acceptance, inliers."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -9,7 +10,8 @@ import pytest
 from snakesfm.config.estimate_two_view import EstimateTwoViewOptions
 from snakesfm.geometry.rotations import angle_between, angle_of
 from snakesfm.two_view.correspondences import first_rows_at_place, unify_matches
-from snakesfm.two_view.estimate import TwoViewEstimate, estimate_two_view_geometry
+from snakesfm.two_view.estimate import TwoViewEstimate, _in_front, estimate_two_view_geometry
+from snakesfm.two_view.sampson import Correspondences
 
 Views = Callable[..., Any]
 OPTIONS = EstimateTwoViewOptions()
@@ -61,6 +63,15 @@ def test_noise_far_above_the_threshold_is_adapted_to(two_views: Views) -> None:
     assert adapted.significance >= tight.significance
 
 
+def test_matches_noisier_than_the_threshold_are_found_with_their_noise(two_views: Views) -> None:
+    views = two_views(seed=2, count=400, noise_px=3.0)
+    tight = estimate(views, EstimateTwoViewOptions(ratio_of="estimator", adapt_error=False))
+    adapted = estimate(views, EstimateTwoViewOptions(ratio_of="estimator"))
+    assert tight.inlier_ratio < 0.2 and 0.4 < adapted.inlier_ratio < 0.8
+    assert tight.sigma_px < 1.6 and 2.4 < adapted.sigma_px < 3.6
+    assert len(adapted.inliers) >= len(tight.inliers) + 20
+
+
 def test_different_focal_lengths(two_views: Views) -> None:
     views = two_views(seed=3, focal_j=1800.0)
     found = estimate(views)
@@ -100,6 +111,31 @@ def test_covariance_tells_the_error(two_views: Views) -> None:
     assert 0.5 < np.mean(ratios) < 2.0
 
 
+def test_covariance_of_a_turning_camera_tells_the_error(two_views: Views) -> None:
+    ratios = []
+    for seed in range(15):
+        views = two_views(seed=300 + seed, outliers=0, count=100, baseline=0.0)
+        found = estimate(views)
+        assert found.kind == "rotation_only"
+        ratios.append(np.radians(errors_deg(found, views)[0]) ** 2 / np.trace(found.covariance[:3, :3]))
+    assert 0.6 < np.mean(ratios) < 4.0
+
+
+def test_keypoints_without_matches_do_not_make_matches_more_significant(two_views: Views) -> None:
+    views = two_views(seed=1)
+    far = np.array([[9000.0, 9000.0]], np.float32)
+    wider = replace(views, keypoints_j=np.concatenate([views.keypoints_j, far]))
+    assert estimate(wider).significance == estimate(views).significance > 10.0
+
+
+@pytest.mark.parametrize("toward", [-1.0, 1.0])
+def test_points_behind_the_second_camera_alone_are_not_in_front(toward: float) -> None:
+    point, translation = np.array([[0.1, 0.05, 0.5]]), np.array([0.0, 0.0, toward])
+    other = point + translation
+    points = Correspondences(point / point[:, 2:], other / other[:, 2:], 900.0, 900.0)
+    np.testing.assert_array_equal(_in_front(points, np.eye(3), translation, 0.3), [toward > 0.0])
+
+
 @pytest.mark.parametrize(
     ("outliers", "count", "reasons"),
     [
@@ -123,6 +159,17 @@ def test_switches_of_acceptance(two_views: Views) -> None:
     before = estimate(views, EstimateTwoViewOptions(ratio_of="estimator", adapt_error=False)).inlier_ratio
     after = estimate(views, EstimateTwoViewOptions(ratio_of="refined", adapt_error=False)).inlier_ratio
     assert before < after
+
+
+@pytest.mark.parametrize(("factor", "rejection"), [(0.5, "indeterminate"), (2.0, "")])
+def test_largest_deviation_of_the_rotation_is_in_degrees(
+    two_views: Views, factor: float, rejection: str
+) -> None:
+    views = two_views(seed=1)
+    std_deg = np.degrees(np.sqrt(np.linalg.eigvalsh(estimate(views).covariance[:3, :3])[-1]))
+    assert 0.005 < std_deg < 0.2
+    options = EstimateTwoViewOptions(max_rotation_std_deg=float(factor * std_deg))
+    assert estimate(views, options).rejection == rejection
 
 
 def test_rejected_without_pose_is_nan_and_empty(two_views: Views) -> None:

@@ -1,7 +1,7 @@
 """Stages calibrate_cameras and estimate_two_view on small artifacts."""
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +27,7 @@ from snakesfm.two_view.estimate import estimate_two_view_geometry
 
 Views = Callable[..., Any]
 HEADER = Header("test", 1, "scene")
+FEATURES = tuple(field.name for field in fields(LocalFeatures))
 
 
 def write_inputs(folder: Path, views: Any, source: str, enlarged: int = 1) -> dict[str, Any]:
@@ -60,6 +61,8 @@ def write_inputs(folder: Path, views: Any, source: str, enlarged: int = 1) -> di
             np.array(sources, dtype=object),
             np.zeros(1),
             np.zeros(1, dtype=np.int32),
+            np.zeros((0, 4), dtype=np.int32),
+            np.zeros(0, dtype=object),
         ).write(folder / "cameras.h5", HEADER)
     keypoints = [views.keypoints_i, views.keypoints_j, views.keypoints_j[:50]]
     total = sum(len(k) for k in keypoints)
@@ -116,6 +119,33 @@ def test_pairs_of_a_tile(two_views: Views, tmp_path: Path, capsys: pytest.Captur
     assert "1 of 2 pairs accepted" in capsys.readouterr().out
 
 
+def test_what_stands_still_on_an_overlay_makes_no_pair(two_views: Views, tmp_path: Path) -> None:
+    views, found = two_views(seed=1), {}
+    inputs = write_inputs(tmp_path, views, "given")
+    # images 0 and 2 share a stamp alone, at the same 50 places
+    columns = {name: getattr(LocalFeatures.read(tmp_path / "features.h5"), name) for name in FEATURES}
+    columns["keypoints"][-50:] = views.keypoints_i[:50]
+    LocalFeatures(**columns).write(tmp_path / "features.h5", HEADER)
+    same = np.column_stack([np.arange(50)] * 2).astype(np.int32)
+    write_matches(tmp_path, [(0, 1), (0, 2)], [views.matches, same])
+    cells = np.unique(np.floor(views.keypoints_i[:50] / 8).astype(np.int32), axis=0)
+    for name, covered in (("none", cells[:0]), ("stamp", cells)):
+        given = CalibratedCameras.read(tmp_path / "cameras.h5")
+        sizes = np.tile([1000, 800], (len(covered), 1))
+        replace(given, overlay_cells=np.hstack([sizes, covered]).astype(np.int32)).write(
+            tmp_path / "cameras.h5", HEADER
+        )
+        estimate_two_view.run(pose_job(tmp_path, inputs))
+        found[name] = TwoViewGeometries.read(tmp_path / "0-0.h5")
+    assert [REJECTIONS[r] for r in found["none"].rejections] == ["", ""]
+    assert found["none"].inlier_counts[1] == 50
+    assert [REJECTIONS[r] for r in found["stamp"].rejections] == ["", "too_few_matches"]
+    assert found["stamp"].digests[1] != found["none"].digests[1]
+    assert found["stamp"].match_counts[1] == 0
+    # the pair that moves keeps its matches in the stamp's cells, but for what is far away
+    assert 297 <= found["stamp"].match_counts[0] <= found["none"].match_counts[0] == 300
+
+
 def test_larger_photographs_are_judged_as_the_detector_saw_them(two_views: Views, tmp_path: Path) -> None:
     views, rows = two_views(seed=1), {}
     for name, enlarged, settings in [
@@ -164,6 +194,40 @@ def test_unchanged_pairs_are_taken_over(
     monkeypatch.setattr(estimate_two_view, "estimate_two_view_geometry", counted)
     estimate_two_view.run(replace(again, options=EstimateTwoViewOptions(min_inliers=20)))
     assert len(calls) == 2
+
+
+def newer() -> EstimateTwoViewOptions:
+    """The options of a version to come."""
+    return type("Newer", (EstimateTwoViewOptions,), {"stage_version": 999})()
+
+
+@pytest.mark.parametrize("change", [{"options": newer()}, {"seed": 6}])
+def test_another_version_or_seed_takes_nothing_over(
+    two_views: Views, tmp_path: Path, change: dict[str, Any]
+) -> None:
+    inputs = write_inputs(tmp_path, two_views(seed=3, count=60, outliers=0), "given")
+    estimate_two_view.run(pose_job(tmp_path, inputs))
+    former, output = tmp_path / "0-0.h5", tmp_path / "again.h5"
+    estimate_two_view.run(pose_job(tmp_path, inputs, former=former, outputs=(output,), **change))
+    digests = [set(TwoViewGeometries.read(path).digests) for path in (former, output)]
+    assert len(digests[0]) == len(digests[1]) == 2 and digests[0].isdisjoint(digests[1])
+
+
+def test_pairs_of_images_with_other_keypoints_are_estimated_again(two_views: Views, tmp_path: Path) -> None:
+    views = two_views(seed=3, count=60, outliers=0)
+    inputs = write_inputs(tmp_path, views, "given")
+    estimate_two_view.run(pose_job(tmp_path, inputs))
+    features = LocalFeatures.read(tmp_path / "features.h5")
+    moved = features.keypoints.copy()
+    moved[features.offsets[1] + views.matches[0, 1]] += 5.0
+    digests = np.array(["da", "another", "dc"], dtype=object)
+    replace(features, keypoints=moved, digests=digests).write(tmp_path / "features.h5", HEADER)
+    former, output = tmp_path / "0-0.h5", tmp_path / "again.h5"
+    estimate_two_view.run(pose_job(tmp_path, inputs, former=former, outputs=(output,)))
+    before, after = (TwoViewGeometries.read(path) for path in (former, output))
+    assert (before.digests == after.digests).tolist() == [False, True]
+    assert not np.array_equal(before.rotations[0], after.rotations[0])
+    assert before.inlier_counts[0] == 60 and after.inlier_counts[0] == 59
 
 
 def test_damaged_former_is_ignored(two_views: Views, tmp_path: Path) -> None:

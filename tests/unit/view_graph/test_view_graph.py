@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from snakesfm.geometry.rotations import angle_of
 from snakesfm.view_graph import cycles as cycles_module
 from snakesfm.view_graph.bridges import find_bridges
+from snakesfm.view_graph.clusters import join_clusters
 from snakesfm.view_graph.components import label_components
 from snakesfm.view_graph.cycles import find_cycles, median_of, smallest_of
 from snakesfm.view_graph.filters import (
@@ -143,6 +144,14 @@ def test_paper_filter_keeps_good_edges_and_names_its_pass():
     assert (refuse_by_cycles(len(pairs), cycles, "min", "none", LIMIT) != "cycle_median").all()
 
 
+@pytest.mark.parametrize(("factor", "reason"), [(0.9, "kept"), (1.1, "cycle_min")])
+def test_cycles_off_by_more_than_the_limit_refuse_their_edges(factor, reason):
+    pairs, rotations = np.array([[0, 1], [0, 2], [1, 2]]), np.tile(np.eye(3), (3, 1, 1))
+    rotations[2] = Rotation.from_rotvec([0.0, 0.0, factor * LIMIT]).as_matrix()
+    reasons = refuse_by_cycles(3, find_cycles(3, pairs, rotations), "min", "median", LIMIT)
+    assert reasons.tolist() == [reason] * 3
+
+
 def test_messages_stand_more_outliers_than_medians():
     pairs, rotations, wrong = noisy_graph(40, 0.7, 4, wrong_share=0.5)
     cycles = find_cycles(40, pairs, rotations)
@@ -198,6 +207,39 @@ def test_few_weak_edges_that_agree_lose_against_stronger_ones():
     reasons = vote(12, pairs, rotations, counts)
     assert (reasons[errors == 0] == "kept").all()
     assert (reasons[errors > 0] == "cluster_vote").all()
+
+
+@pytest.mark.parametrize(
+    ("factor", "in_a_cycle", "reason"),
+    [(0.5, True, "kept"), (0.5, False, "kept"), (2.0, True, "cluster_vote"), (2.0, False, "kept")],
+)
+def test_edges_without_a_cycle_may_drift_further_from_the_vote(factor, in_a_cycle, reason):
+    truth = Rotation.random(8, np.random.default_rng(0)).as_matrix()
+    inside = [(i, j) for i, j in itertools.combinations(range(8), 2) if (i < 4) == (j < 4)]
+    pairs = np.array(sorted([*inside, *((k, k + 4) for k in range(4))]))
+    rotations = truth[pairs[:, 1]] @ truth[pairs[:, 0]].transpose(0, 2, 1)
+    across = pairs[:, 1] - pairs[:, 0] == 4
+    off = np.flatnonzero(across)[3]
+    rotations[off] = Rotation.from_rotvec([0.0, 0.0, factor * LIMIT]).as_matrix() @ rotations[off]
+    confirmed = ~across
+    confirmed[off] = in_a_cycle
+    counts, reasons = np.where(across, 10, 200), np.full(len(pairs), "kept", dtype=object)
+    voted = vote_between_clusters(8, pairs, rotations, counts, reasons, confirmed, 50, LIMIT)
+    assert voted[off] == reason and (np.delete(voted, off) == "kept").all()
+
+
+@pytest.mark.parametrize("small", [(0, 1), (5, 6)])
+def test_either_end_of_a_joining_edge_may_be_in_the_smaller_cluster(small):
+    truth = Rotation.random(7, np.random.default_rng(0)).as_matrix()
+    inside = [(i, j) for i, j in itertools.combinations(range(7), 2) if (i in small) == (j in small)]
+    joint = (1, 2) if 0 in small else (4, 5)
+    pairs = np.array(sorted([*inside, joint]))
+    rotations = truth[pairs[:, 1]] @ truth[pairs[:, 0]].transpose(0, 2, 1)
+    trusted = (pairs != joint).any(axis=1)
+    joining, frames = join_clusters(7, pairs, rotations, np.ones(len(pairs)), trusted, 0.1)
+    np.testing.assert_array_equal(joining, ~trusted)
+    residuals = frames[pairs[:, 1]].transpose(0, 2, 1) @ rotations @ frames[pairs[:, 0]]
+    assert angle_of(residuals).max() < 1e-9
 
 
 def test_vote_never_cuts_the_graph():

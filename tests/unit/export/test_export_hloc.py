@@ -1,0 +1,99 @@
+"""Stage export_hloc: image names that hloc cannot read are said."""
+
+import io
+
+import numpy as np
+import pytest
+
+from snakesfm.artifacts import Header, ImageIndex, LocalFeatures, PairMatches, TwoViewGeometries
+from snakesfm.config.export_hloc import ExportHlocOptions
+from snakesfm.geometry.camera import PARAM_SLOTS
+from snakesfm.stages import export_hloc
+from snakesfm.stages.job import Progress, StageJob
+
+
+def export(folder, names, pairs):
+    """The stage on images of two keypoints, of which each pair matches the first."""
+    count = len(names)
+    header = Header("stage", 1, "scene")
+    index, features, matches, geometries = (folder / f"{name}.h5" for name in "ifmg")
+    ImageIndex(
+        names=names,
+        sizes=np.tile([320, 240], (count, 1)),
+        sha256=names,
+        blocks=np.zeros(count, int),
+        camera_ids=np.zeros(count, int),
+        orientations=np.ones(count, int),
+        focal_exif_px=np.full(count, np.nan),
+        gps=np.full((count, 3), np.nan),
+        duplicate_of=np.full(count, -1),
+        camera_models=["PINHOLE"],
+        camera_sizes=[[320, 240]],
+        camera_params=np.full((1, PARAM_SLOTS), np.nan),
+        camera_sources=["given"],
+        refused_names=[],
+        refused_reasons=[],
+        warnings=[],
+    ).write(index, header)
+    LocalFeatures(
+        image_ids=np.arange(count),
+        names=names,
+        digests=names,
+        sizes=np.tile([320, 240], (count, 1)),
+        offsets=np.arange(count + 1) * 2,
+        keypoints=np.tile([[10.5, 20.5], [30.5, 40.5]], (count, 1)),
+        descriptors=np.zeros((2 * count, 128), np.uint8),
+        scores=np.ones(2 * count),
+        scales=np.ones(2 * count),
+        angles=np.zeros(2 * count),
+        colors=np.zeros((2 * count, 3), np.uint8),
+    ).write(features, header)
+    rows = len(pairs)
+    PairMatches(
+        pairs=pairs,
+        digests=[""] * rows,
+        offsets=np.arange(rows + 1),
+        matches=np.zeros((rows, 2), int),
+        scores=np.ones(rows),
+    ).write(matches, header)
+    TwoViewGeometries(
+        pairs=pairs,
+        digests=[""] * rows,
+        rotations=np.full((rows, 3, 3), np.nan),
+        translations=np.full((rows, 3), np.nan),
+        covariances=np.full((rows, 5, 5), np.nan),
+        kinds=np.zeros(rows, np.int8),
+        rejections=np.ones(rows, np.int8),
+        match_counts=np.ones(rows, int),
+        inlier_counts=np.zeros(rows, int),
+        inlier_ratios=np.zeros(rows),
+        triangulation_angles_deg=np.zeros(rows),
+        offsets=np.zeros(rows + 1, int),
+        inliers=np.zeros((0, 2), int),
+    ).write(geometries, header)
+    export_hloc.run(
+        StageJob(
+            stage="export_hloc",
+            scene="scene",
+            inputs={"index": index, "features": features, "matches": matches, "geometries": geometries},
+            outputs=tuple(folder / name for name in ("features.h5", "matches.h5", "pairs.txt")),
+            options=ExportHlocOptions(matches="putative"),
+        )
+    )
+    return (folder / "pairs.txt").read_text("utf-8")
+
+
+@pytest.mark.parametrize("name", ["b 1.jpg", "my photos/b.jpg", "b\u00a01.jpg"])
+def test_names_with_spaces_are_warned_of_in_the_log_and_on_the_terminal(
+    name, tmp_path, capsys, monkeypatch
+):
+    terminal = io.StringIO()
+    monkeypatch.setattr(Progress, "terminal", terminal)
+    assert export(tmp_path, ["a.jpg", name], [[0, 1]]) == f"a.jpg {name}\n"
+    assert f"warning: {export_hloc.SPACES}\n" in capsys.readouterr().err
+    assert terminal.getvalue() == f"snakesfm: scene 'scene': warning: {export_hloc.SPACES}\n"
+
+
+def test_other_names_give_no_warning(tmp_path, capsys):
+    assert export(tmp_path, ["a.jpg", "b_1.jpg", "not matched.jpg"], [[0, 1]]) == "a.jpg b_1.jpg\n"
+    assert "warning" not in capsys.readouterr().err

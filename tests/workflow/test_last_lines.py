@@ -1,0 +1,129 @@
+"""What a run says of its results in the end, where it was ended before or was to make others."""
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from workflow_runner import Workflow, copy_run, model_bytes
+
+pytestmark = pytest.mark.workflow
+
+# Snakemake, which gets TERM from itself while it deals with a job that has ended
+TERM_IN_TIME = """
+import os, signal
+from snakemake.cli import main
+from snakemake.scheduling.job_scheduler import JobScheduler
+
+finish_jobs = JobScheduler._finish_jobs
+
+def finish_and_terminate(scheduler):
+    finish_jobs(scheduler)
+    if scheduler.finished_jobs:
+        os.kill(os.getpid(), signal.SIGTERM)
+
+JobScheduler._finish_jobs = finish_and_terminate
+main()
+"""
+
+
+def config_of(scene: Path, *options: str) -> list[str]:
+    folders = (f"images={scene / 'images'}", f"reference={scene / 'reference'}", "output=out")
+    return ["--config", *folders, *options]
+
+
+def test_a_controller_that_gets_term_while_it_deals_with_ended_jobs_ends(
+    finished, small_scene: Path, workflow: Workflow
+) -> None:
+    copy_run(finished[0], workflow.folder)
+    script = workflow.folder / "snakemake_with_term.py"
+    script.write_text(TERM_IN_TIME)
+    arguments = workflow.command(*config_of(small_scene, "match_pairs={max_ratio: 0.75}"))
+    assert arguments[1:3] == ["-m", "snakemake"]
+    ended = subprocess.run(
+        [sys.executable, str(script), *arguments[3:]],
+        cwd=workflow.folder,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+    assert ended.returncode == 1, ended.stdout
+    assert "rule match_pairs" in ended.stdout and "rule adjust_bundle" not in ended.stdout
+    lines = [line for line in ended.stdout.splitlines() if line.startswith("snakesfm: scene")]
+    # all results of the former options are still there
+    assert lines[-1] == "snakesfm: scene 'square' is not finished: start the same command again."
+    again = workflow.run(*config_of(small_scene))
+    assert again.status == 0, again.text
+    assert "16 of 16 images registered" in again.summary[-1]
+    assert model_bytes(workflow.folder / "out" / "square") == model_bytes(finished[0])
+
+
+@pytest.mark.parametrize(
+    ("target", "option", "rules"),
+    [
+        (["--until", "match_pairs"], "match_pairs={max_ratio: 0.75}", {"match_pairs"}),
+        # no file that the model is made from is newer than it
+        (["databases"], "adjust_bundle={max_iterations: 77}", {"export_database", "databases"}),
+    ],
+)
+def test_a_model_of_former_options_is_not_called_this_run_s(
+    finished, small_scene: Path, workflow: Workflow, target: list[str], option: str, rules: set[str]
+) -> None:
+    copy_run(finished[0], workflow.folder)
+    outcome = workflow.run(*target, *config_of(small_scene, option))
+    assert outcome.status == 0, outcome.text
+    assert set(outcome.rules) == rules
+    *_, line = outcome.summary
+    assert "the model is older than its images or options: 'all' updates it" in line
+    assert "registered" not in line
+    assert ("COLMAP database in out/square/export_database/database.db" in line) == (
+        target == ["databases"]
+    )
+
+
+def test_a_model_of_these_options_is_named_beside_the_database(
+    finished, small_scene: Path, workflow: Workflow
+) -> None:
+    copy_run(finished[0], workflow.folder)
+    outcome = workflow.run("databases", *config_of(small_scene))
+    assert outcome.status == 0, outcome.text
+    *_, line = outcome.summary
+    assert "16 of 16 images registered" in line and "relative-pose AUC" in line
+    assert line.endswith(
+        "model in out/square/export_model/sparse/0, "
+        "COLMAP database in out/square/export_database/database.db"
+    )
+    # the database was not asked for, so nobody has looked whether it is of these options
+    other = workflow.run("--until", "export_model", *config_of(small_scene, "build_tracks={min_length: 4}"))
+    assert other.status == 0, other.text
+    *_, line = other.summary
+    assert "images registered" in line
+    # metrics are of the former model
+    assert "database" not in line and "relative-pose AUC" not in line
+
+
+def test_rule_select_pairs_is_known_by_its_name_where_scenes_differ_in_blocks(
+    small_scene: Path, workflow: Workflow
+) -> None:
+    images = sorted((small_scene / "images").iterdir())
+    for scene, count in (("few", 16), ("many", 70), ("others", 10)):
+        (workflow.folder / scene).mkdir()
+        for number in range(count):
+            (workflow.folder / scene / f"{number:02d}.jpg").symlink_to(images[number % 16])
+    scenes = ", ".join(f"{name}: {{images: {name}}}" for name in ("few", "many", "others"))
+    arguments = ["--dry-run", "--config", f"scenes={{{scenes}}}", "output=out"]
+    resources = ["--set-resources", "select_pairs:mem_mb=1234", "--set-threads", "select_pairs=1"]
+    outcome = workflow.run(*arguments, *resources)
+    assert outcome.status == 0, outcome.text
+    assert outcome.rules.count("select_pairs") == 2
+    assert outcome.rules.count("select_pairs_4_blocks") == 1
+    assert len(re.findall(r"^ +resources: .*mem_mb=1234", outcome.text, re.M)) == 3
+    some = workflow.run(*arguments, "--until", "select_pairs")
+    assert some.status != 0 and "'select_pairs select_pairs_4_blocks'" in some.text
+    assert "Traceback" not in some.text
+    until = workflow.run(*arguments, "--until", "select_pairs", "select_pairs_4_blocks")
+    assert until.status == 0, until.text
+    assert until.rules.count("select_pairs") == 2 and "match_pairs" not in until.rules
