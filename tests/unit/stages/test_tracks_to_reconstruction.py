@@ -272,9 +272,13 @@ def test_a_principal_point_that_seems_too_far_off_is_told_of(made, inputs, tmp_p
     # beyond what is believed, however much the errors fall
     shifted = replace(camera, params=(*camera.params[:2], 80.0, *camera.params[3:]))
     models, sizes, params, sources = cameras_to_columns([shifted])
-    CalibratedCameras(models, sizes, params, sources, np.full(1, np.nan), np.zeros(1, int)).write(
-        inputs["cameras"], HEADER
-    )
+    replace(
+        CalibratedCameras.read(inputs["cameras"]),
+        models=models,
+        sizes=sizes,
+        params=params,
+        sources=sources,
+    ).write(inputs["cameras"], HEADER)
     run_all(inputs, tmp_path)
     run(
         adjust_bundle,
