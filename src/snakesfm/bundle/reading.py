@@ -1,5 +1,6 @@
 """Points, observations and keypoints of a ``pycolmap.Reconstruction`` as arrays."""
 
+import struct
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -68,6 +69,8 @@ def _tracks(path: Path) -> Tracks:
         heads.append(content[at:track])
         at = track + ELEMENT.itemsize * COUNT.unpack_from(content, track - COUNT.size)[0]
         tracks.append(content[track:at])
+    if at > len(content):
+        raise struct.error(f"{path.name} ends within a track")
     points = np.frombuffer(b"".join(heads), POINT)
     elements = np.frombuffer(b"".join(tracks), ELEMENT)
     del content, heads, tracks

@@ -282,7 +282,7 @@ class _Mapper:
         while not settled:
             self.prepare(settings.complete_tracks, sources)
             self.round("principal points again", settings.thresholds_px[-1], "final")
-            settled = self.records[-1].error_px > SETTLED_SHARE * self.records[-2].error_px
+            settled = not self.records[-1].error_px < SETTLED_SHARE * self.records[-2].error_px
         self.solving = before
 
     def drop_outliers(self) -> None:

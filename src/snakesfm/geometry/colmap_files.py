@@ -5,6 +5,8 @@ microsecond per observation. Its binary files (COLMAP's documentation, "Output F
 numbers to the bit and are written and read in a tenth of that.
 """
 
+import errno
+import os
 import struct
 import tempfile
 from collections.abc import Iterator
@@ -41,16 +43,24 @@ OTHER_LAYOUT = (
 
 @contextmanager
 def written_files(reconstruction: pycolmap.Reconstruction) -> Iterator[Path]:
-    """A folder that holds the reconstruction's binary files; deleted at the end.
+    """A folder for temporary files that holds the reconstruction's binary files; deleted at the end.
 
     Raises
     ------
     ConfigError : the installed pycolmap writes files of another layout.
+    OSError : there is no room for them, or for what the caller writes; it names the temporary folder.
     """
     check_layout()
-    with tempfile.TemporaryDirectory(prefix="snakesfm.") as name:
-        reconstruction.write_binary(name)
-        yield Path(name)
+    try:
+        with tempfile.TemporaryDirectory(prefix="snakesfm.") as name:
+            reconstruction.write_binary(name)
+            yield Path(name)
+    except OSError as error:
+        raise OSError(error.errno, error.strerror, tempfile.gettempdir()) from error
+    except struct.error as error:
+        # where there is no more room pycolmap leaves its files cut off without a word
+        full = errno.ENOSPC
+        raise OSError(full, os.strerror(full), tempfile.gettempdir()) from error
 
 
 def read_image_head(file: BinaryIO) -> tuple[int, bytes, int]:

@@ -15,8 +15,10 @@ Array = NDArray[Any]
 CELL_PX = 8
 # between two images of an overlay, and what its keypoints may move where neighbouring pixels change
 STILL_PX, DROPPED_PX = 1.0, 3.0
-# a pair that stands still as a whole shows one view twice, which says nothing of an overlay
+# a pair that stands still as a whole shows one view twice, and where the rest hardly moves, as in slow videos,
+# what is far stands still too: neither says anything of an overlay
 WHOLE = 0.9
+MOVED_PX = 10.0
 MIN_MATCHES = 15
 MIN_PAIRS = 3
 # where a cell recurs in enough pairs there is an overlay, and its margins are seen less often
@@ -25,7 +27,7 @@ NEIGHBOURS = np.stack(np.meshgrid((-1, 0, 1), (-1, 0, 1)), -1).reshape(-1, 2)
 
 
 def find_overlay_cells(pairs: Iterable[tuple[tuple[int, int], Array, Array]], share: float) -> Array:
-    """Cells in which matches stand still, in many pairs of images that do not stand still as a whole.
+    """Cells in which matches stand still, in many pairs of images of which all else moves.
 
     Parameters
     ----------
@@ -44,7 +46,8 @@ def find_overlay_cells(pairs: Iterable[tuple[tuple[int, int], Array, Array]], sh
         if len(first) < MIN_MATCHES:
             continue
         still = _stand_still(first, second, STILL_PX)
-        if still.mean() > WHOLE:
+        moved = np.linalg.norm(first[~still] - second[~still], axis=1)
+        if still.mean() > WHOLE or np.median(moved) < MOVED_PX:
             continue
         counts[size] = counts.get(size, 0) + 1
         tally = tallies.setdefault(size, np.zeros(_grid_of(size), np.int32))

@@ -1,8 +1,13 @@
 """What is read from pycolmap's files is what its objects say."""
 
+import errno
+import tempfile
+from pathlib import Path
+
 import cv2  # noqa: F401
 import numpy as np
 import pycolmap
+import pytest
 
 from snakesfm.bundle.model import BundleModel, to_reconstruction
 from snakesfm.bundle.reading import read_tracks, read_tracks_and_pixels
@@ -72,3 +77,32 @@ def test_an_empty_model_has_none():
     tracks, pixels = read_tracks_and_pixels(pycolmap.Reconstruction())
     assert {len(values) for values in vars(tracks).values()} == {0}
     assert tracks.points.shape == (0, 3) and pixels.shape == (0, 2)
+
+
+class OnAFullDisk:
+    """A model of which pycolmap writes the points no farther than the disk has room."""
+
+    def __init__(self, room: float) -> None:
+        self.model, self.room = reconstruction_with_gaps(), room
+
+    def write_binary(self, folder: str) -> None:
+        self.model.write_binary(folder)
+        path = Path(folder) / "points3D.bin"
+        content = path.read_bytes()
+        path.write_bytes(content[: int(self.room * len(content))])
+
+
+@pytest.mark.parametrize("room", [0.0, 0.001, 0.3, 0.5, 0.999])
+def test_a_full_disk_for_temporary_files_is_named(room, tmp_path, monkeypatch):
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    with pytest.raises(OSError, match="No space left") as error:
+        read_tracks(OnAFullDisk(room))
+    assert (error.value.errno, error.value.filename) == (errno.ENOSPC, str(tmp_path))
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_folder_for_temporary_files_that_is_gone_is_named(tmp_path, monkeypatch):
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "gone"))
+    with pytest.raises(OSError, match="No such file") as error:
+        read_tracks(reconstruction_with_gaps())
+    assert error.value.filename == str(tmp_path / "gone")

@@ -71,10 +71,16 @@ def test_the_margins_of_an_overlay_that_something_hides_belong_to_it() -> None:
 @pytest.mark.parametrize("share", [0.1, 0.3])
 def test_scenes_without_an_overlay_have_none(share: float) -> None:
     assert len(find_overlay_cells(matched_pairs(3, overlay=0), share)) == 0
-    # a camera that hardly moves between some images, and copies of one view
-    slow = matched_pairs(4, overlay=0, moved=0.0, twins=True)[:15]
-    assert len(find_overlay_cells(slow + matched_pairs(4, overlay=0)[15:], share)) == 0
+    # copies of one view
+    twins = matched_pairs(4, overlay=0, twins=True)[:15]
+    assert len(find_overlay_cells(twins + matched_pairs(4, overlay=0)[15:], share)) == 0
     assert len(find_overlay_cells([], share)) == 0
+
+
+@pytest.mark.parametrize(("moved", "found"), [(6.0, False), (20.0, True)])
+def test_what_is_far_in_a_slow_video_is_no_overlay(moved: float, found: bool) -> None:
+    cells = find_overlay_cells(matched_pairs(7, overlay=12, moved=moved), 0.3)
+    assert (100 < len(cells) < 230) if found else len(cells) == 0
 
 
 def test_what_few_pairs_show_is_no_overlay() -> None:
