@@ -15,7 +15,7 @@ Array = NDArray[Any]
 CELL_PX = 8
 # between two images of an overlay, and what its keypoints may move where neighbouring pixels change
 STILL_PX, DROPPED_PX = 1.0, 3.0
-# a pair that stands still as a whole shows one view twice, and where the rest hardly moves, as in slow videos,
+# a pair that stands still as a whole shows one view twice, and where the rest hardly moves (slow videos),
 # what is far stands still too: neither says anything of an overlay
 WHOLE = 0.9
 MOVED_PX = 10.0
