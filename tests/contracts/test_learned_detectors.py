@@ -148,5 +148,5 @@ class TestSuperpointOfRandomWeights(DetectorContract):
         one, other = (extract(d, *shapes(), 50, 760) for d in (detector, again))
         np.testing.assert_array_equal(one.descriptors, other.descriptors)
         (tmp_path / "superpoint.safetensors").write_bytes(b"damaged")
-        with pytest.raises(ConfigError, match="holds no weights"):
+        with pytest.raises(ConfigError, match="contains no weights"):
             read_checkpoint(self.method, tmp_path, "fetch")
