@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 
 from snakesfm.grouping import components_of
 from snakesfm.translation_averaging.angular import refine_angles
-from snakesfm.translation_averaging.averagers import TranslationAverager, edge_angles_rad, with_rays
-from snakesfm.translation_averaging.landmarks import angles_rad, intersect
+from snakesfm.translation_averaging.averagers import TranslationAverager, with_rays
+from snakesfm.translation_averaging.landmarks import angles_rad, edge_angles_rad, intersect
 from snakesfm.translation_averaging.problem import PositioningProblem
 from snakesfm.translation_averaging.support import SupportLimits, attach_cameras, held_cameras
 

@@ -7,8 +7,9 @@ from typing import Any, Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from snakesfm.translation_averaging.landmarks import cover_cameras
+from snakesfm.translation_averaging.landmarks import cover_cameras, edge_angles_rad
 from snakesfm.translation_averaging.problem import PositioningProblem
+from snakesfm.translation_averaging.scale_chain import chain_centers
 from snakesfm.view_graph.components import label_components
 
 Array = NDArray[Any]
@@ -46,8 +47,6 @@ class ScaleChain:
 
     def link(self, problem: PositioningProblem) -> Array | None:
         """Centres (N,3), or None where the landmarks link fewer than half of the cameras."""
-        from snakesfm.translation_averaging.scale_chain import chain_centers
-
         rays = with_rays(problem, self.rays_per_camera)
         centers = chain_centers(rays, 1.5 * self.sigma_rad, self.max_relative_sigma)
         return None if 2 * np.isfinite(centers[:, 0]).sum() < len(problem.images()) else centers
@@ -142,10 +141,3 @@ def share_at_one_scale(pairs: Array, centers: Array, others: Array) -> float:
     alike = np.abs(gaps - np.median(gaps)) < math.log(LARGEST_SCALE_GAP)
     labels = label_components(len(centers), edges[alike])
     return float(np.bincount(labels[both]).max() / both.sum())
-
-
-def edge_angles_rad(problem: PositioningProblem, centers: Array) -> Array:
-    """Angles (E) between the edges' directions and those between the centres; NaN where one is missing."""
-    baselines = centers[problem.pairs[:, 1]] - centers[problem.pairs[:, 0]]
-    cross = np.linalg.norm(np.cross(baselines, problem.directions), axis=1)
-    return np.asarray(np.arctan2(cross, np.einsum("ei,ei->e", baselines, problem.directions)))

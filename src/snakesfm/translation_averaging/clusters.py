@@ -13,8 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from snakesfm.translation_averaging.averagers import edge_angles_rad
-from snakesfm.translation_averaging.landmarks import perpendicular, usual_error_rad
+from snakesfm.translation_averaging.landmarks import edge_angles_rad, perpendicular, usual_error_rad
 from snakesfm.translation_averaging.problem import PositioningProblem
 
 Array = NDArray[Any]

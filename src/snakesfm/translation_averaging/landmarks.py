@@ -77,3 +77,10 @@ def usual_error_rad(angles: Array, least_rad: float) -> float:
     """Standard deviation that residual angles (Q) show, at least ``least_rad``; NaN ones do not count."""
     angles = angles[np.isfinite(angles)]
     return max(least_rad, 1.5 * float(np.median(angles))) if len(angles) else least_rad
+
+
+def edge_angles_rad(problem: PositioningProblem, centers: Array) -> Array:
+    """Angles (E) between the edges' directions and those between the centres; NaN where one is missing."""
+    baselines = centers[problem.pairs[:, 1]] - centers[problem.pairs[:, 0]]
+    cross = np.linalg.norm(np.cross(baselines, problem.directions), axis=1)
+    return np.asarray(np.arctan2(cross, np.einsum("ei,ei->e", baselines, problem.directions)))

@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from snakesfm.grouping import sum_by
-from snakesfm.translation_averaging.averagers import edge_angles_rad
 from snakesfm.translation_averaging.landmarks import (
     angles_rad,
+    edge_angles_rad,
     intersect,
     perpendicular,
     usual_error_rad,

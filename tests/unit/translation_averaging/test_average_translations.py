@@ -11,11 +11,10 @@ from snakesfm.translation_averaging.averagers import (
     GlobalPositioning,
     ScaleChain,
     TranslationRecovery,
-    edge_angles_rad,
     share_at_one_scale,
     with_rays,
 )
-from snakesfm.translation_averaging.landmarks import cover_cameras, intersect
+from snakesfm.translation_averaging.landmarks import cover_cameras, edge_angles_rad, intersect
 from snakesfm.translation_averaging.problem import (
     PositioningProblem,
     direction_sigmas,
