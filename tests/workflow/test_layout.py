@@ -2,6 +2,7 @@
 
 import ast
 import re
+from graphlib import TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -86,6 +87,28 @@ def test_domains_import_no_stage_no_artifact_and_no_workflow(file: Path) -> None
         name for name in imported for ban in DOMAIN_MAY_IMPORT_NOT if (name + ".").startswith(ban + ".")
     }
     assert not wrong
+
+
+def imported_packages(file: Path) -> set[str]:
+    """Packages, and modules beside them, of ``snakesfm`` that a file imports, inside of functions too."""
+    names = set()
+    for node in ast.walk(ast.parse(file.read_text())):
+        if isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            names |= {f"{node.module}.{alias.name}" for alias in node.names}
+    return {name.split(".")[1] for name in names if name.startswith("snakesfm.")}
+
+
+def test_imports_between_packages_form_no_cycle(root: Path) -> None:
+    source = root / "src" / "snakesfm"
+    imports: dict[str, set[str]] = {}
+    for file in sorted(source.rglob("*.py")):
+        package = file.relative_to(source).with_suffix("").parts[0]
+        imports.setdefault(package, set()).update(imported_packages(file) - {package})
+    assert "grouping" in imports["view_graph"] and "stages" in imports["job"]
+    # raises an error that names the packages of a cycle
+    TopologicalSorter(imports).prepare()
 
 
 def loads(node: ast.AST, package: str) -> bool:

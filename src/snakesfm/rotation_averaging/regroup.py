@@ -6,6 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from snakesfm.rotation_averaging.base import RotationGraph, edge_residuals
+from snakesfm.rotation_averaging.clusters import join_clusters
+from snakesfm.view_graph.bridges import find_bridges
 
 Array = NDArray[Any]
 
@@ -25,9 +27,6 @@ def regroup_nodes(graph: RotationGraph, averaged: Array, tolerance_rad: float) -
     -------
     (N,3,3), rough rotations to descend from.
     """
-    from snakesfm.view_graph.bridges import find_bridges
-    from snakesfm.view_graph.clusters import join_clusters
-
     holding = edge_residuals(graph.pairs, graph.rotations, averaged) < tolerance_rad
     rows = np.flatnonzero(holding)
     holding[rows[find_bridges(graph.node_count, graph.pairs[rows])]] = False

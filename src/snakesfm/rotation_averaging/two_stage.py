@@ -15,6 +15,8 @@ from snakesfm.rotation_averaging.moves import CLEAN, SEARCH_DEGREE, contradicted
 from snakesfm.rotation_averaging.noise import fill_covariances, fit_noise, squared_lengths, student_weights
 from snakesfm.rotation_averaging.rejection import contradiction, residual_limit
 from snakesfm.rotation_averaging.tree import tree_rotations
+from snakesfm.view_graph.cycles import find_cycles
+from snakesfm.view_graph.messages import edge_errors
 
 Array = NDArray[Any]
 
@@ -72,9 +74,6 @@ class TwoStageAverager(RotationAverager):
         First the tree of most inliers: edges of repeated structure confirm each other, but have fewer. Then
         the tree of least error by cycle messages.
         """
-        from snakesfm.view_graph.cycles import find_cycles
-        from snakesfm.view_graph.messages import edge_errors
-
         cycles = find_cycles(graph.node_count, graph.pairs, graph.rotations)
         unverified = np.where(np.isnan(cycles.smallest), 0.5, cycles.smallest > self.robust.scale_rad)
         costs = graph.weights.min() / graph.weights + unverified

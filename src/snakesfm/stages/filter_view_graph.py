@@ -8,10 +8,11 @@ import numpy as np
 
 from snakesfm.artifacts.images import ImageIndex
 from snakesfm.artifacts.pairs import EDGE_LABELS, ViewGraph
+from snakesfm.rotation_averaging.clusters import vote_between_clusters
 from snakesfm.stages.job import StageJob
 from snakesfm.view_graph.components import label_components
 from snakesfm.view_graph.cycles import Cycles, find_cycles, median_of
-from snakesfm.view_graph.filters import refuse_by_cycles, refuse_by_messages, vote_between_clusters
+from snakesfm.view_graph.filters import refuse_by_cycles, refuse_by_messages
 
 if TYPE_CHECKING:
     from snakesfm.config.filter_view_graph import FilterViewGraphOptions

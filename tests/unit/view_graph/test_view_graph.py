@@ -10,16 +10,15 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial.transform import Rotation
 
 from snakesfm.geometry.rotations import angle_of
+from snakesfm.rotation_averaging.clusters import join_clusters, vote_between_clusters
 from snakesfm.view_graph import cycles as cycles_module
 from snakesfm.view_graph.bridges import find_bridges
-from snakesfm.view_graph.clusters import join_clusters
 from snakesfm.view_graph.components import label_components
 from snakesfm.view_graph.cycles import find_cycles, median_of, smallest_of
 from snakesfm.view_graph.filters import (
     keep_largest_component,
     refuse_by_cycles,
     refuse_by_messages,
-    vote_between_clusters,
 )
 from snakesfm.view_graph.messages import edge_errors
 

@@ -14,6 +14,51 @@ Array = NDArray[Any]
 VOTES_AT_ONCE = 1000
 """Votes that are compared with all others of their two clusters at once."""
 
+LOOSE = 3.0
+"""Edges without a cycle may differ from rough rotations by so many tolerances: those drift along chains."""
+
+
+def vote_between_clusters(
+    node_count: int,
+    pairs: Array,
+    rotations: Array,
+    inlier_counts: Array,
+    reasons: Array,
+    confirmed: Array,
+    min_inliers: int,
+    tolerance_rad: float,
+) -> Array:
+    """Join what the cycles left apart, and refuse what contradicts the joins.
+
+    Images that are held together by confirmed edges of at least ``min_inliers`` inliers form clusters. All
+    other edges between clusters vote on how to join them, those that cycles refused included: a right edge
+    between two groups of images is often in wrong cycles only, and a few wrong edges of few inliers often
+    confirm each other.
+
+    Parameters
+    ----------
+    reasons : (E,) str, of the cycle filter.
+    confirmed : (E,) bool, edges that the cycle filter kept and that are in a cycle.
+    min_inliers : confirmed edges of fewer inliers hold no cluster together, but vote.
+    tolerance_rad : votes that differ by less agree.
+
+    Returns
+    -------
+    (E,) str, the reasons after the vote; the kept edges connect all that any edges connect.
+    """
+    core = confirmed & (inlier_counts >= min_inliers)
+    clusters = label_components(node_count, pairs[core])
+    inside = clusters[pairs[:, 0]] == clusters[pairs[:, 1]]
+    if inside.all() and confirmed[reasons == "kept"].all():
+        return reasons
+    weights = inlier_counts.astype(np.float64)
+    joining, frames = join_clusters(node_count, pairs, rotations, weights, core, tolerance_rad)
+    heads, tails = frames[pairs[:, 0]], frames[pairs[:, 1]]
+    residuals = angle_of(tails.transpose(0, 2, 1) @ rotations @ heads)
+    fitting = residuals <= np.where(confirmed, 1.0, LOOSE) * tolerance_rad
+    kept = joining | ((reasons == "kept") & (fitting | (inside & confirmed)))
+    return np.where(kept, "kept", np.where(reasons == "kept", "cluster_vote", reasons)).astype(object)
+
 
 def join_clusters(
     node_count: int, pairs: Array, rotations: Array, weights: Array, trusted: Array, tolerance_rad: float
