@@ -32,11 +32,6 @@ LEARNED_DETECTORS = ("aliked", "disk", "xfeat", "superpoint")
 LEARNED_METHODS = (*LEARNED_DETECTORS, "lightglue", "superglue", "loftr", *LEARNED_DESCRIPTORS)
 # matchers that need no keypoints; a detector then serves the choice of pairs alone
 DETECTOR_FREE = ("loftr", "virtual_places")
-# what jobs are told of the size to which images are scaled down for the detector
-SHORTER_SIDE = "detector_shorter_side_px"
-LONGER_SIDE = "detector_longer_side_px"
-# to which a matcher without keypoints leaves the shorter side of long images: LoFTR ignores a border
-LEAST_SIDE_PX = 64
 # the detectors whose keypoints a matcher understands; the others take any
 TRAINED_ON: dict[str, tuple[str, ...]] = {
     "lightglue": LEARNED_DETECTORS,

@@ -19,12 +19,11 @@ from snakesfm.front_ends import (
     DETECTOR_FREE,
     FRONT_ENDS,
     LEARNED_DESCRIPTORS,
-    LONGER_SIDE,
-    SHORTER_SIDE,
     check_methods,
     fetch_command,
     needed_weights,
 )
+from snakesfm.geometry.detector_sides import LONGER_SIDE, SHORTER_SIDE
 from snakesfm.ingest.discover import count_images, fingerprint_images
 from snakesfm.pair_lists import estimate_pair_count, find_pair_list, pair_list_state
 from snakesfm.resources import Load, job_load

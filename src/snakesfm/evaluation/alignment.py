@@ -1,35 +1,18 @@
 """Robust Sim(3) alignment of camera poses to reference poses."""
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from snakesfm.evaluation.pose_errors import compared_images
+from snakesfm.geometry.poses import Similarity
 from snakesfm.geometry.robust import robust_sigma
 
 Array = NDArray[Any]
 ITERATIONS = 100
 TOLERANCE = 1e-12
 MOST_PAIRS = 400_000
-
-
-@dataclass(frozen=True)
-class Similarity:
-    """reference_from_model: x_reference = scale * rotation @ x_model + translation."""
-
-    scale: float
-    rotation: Array
-    translation: Array
-
-    def transform_points(self, points: Array) -> Array:
-        """Points (..., 3) of the model in the reference's world and units."""
-        return self.scale * points @ self.rotation.T + self.translation
-
-    def transform_rotations(self, rotations: Array) -> Array:
-        """cam_from_world rotations (..., 3, 3) of the model as cam_from_reference."""
-        return rotations @ self.rotation.T
 
 
 def project_to_so3(matrix: Array) -> Array:

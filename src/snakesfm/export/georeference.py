@@ -6,9 +6,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from snakesfm.evaluation.alignment import Similarity
 from snakesfm.geometry.colmap_binding import pycolmap
 from snakesfm.geometry.earth import Origin, local_metres
+from snakesfm.geometry.poses import Similarity
 from snakesfm.geometry.robust import robust_sigma
 
 Array = NDArray[Any]

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from snakesfm.front_ends import LEAST_SIDE_PX, LONGER_SIDE, SHORTER_SIDE
 from snakesfm.geometry.camera import Camera
+from snakesfm.geometry.detector_sides import LEAST_SIDE_PX, LONGER_SIDE, SHORTER_SIDE
 
 Array = NDArray[Any]
 

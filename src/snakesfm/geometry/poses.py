@@ -1,5 +1,6 @@
-"""Rigid poses as arrays, and the way to pycolmap's."""
+"""Rigid poses as arrays, the way to pycolmap's, and similarities between worlds."""
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -9,6 +10,23 @@ if TYPE_CHECKING:
     import pycolmap
 
 Array = NDArray[Any]
+
+
+@dataclass(frozen=True)
+class Similarity:
+    """reference_from_model: x_reference = scale * rotation @ x_model + translation."""
+
+    scale: float
+    rotation: Array
+    translation: Array
+
+    def transform_points(self, points: Array) -> Array:
+        """Points (..., 3) of the model in the reference's world and units."""
+        return self.scale * points @ self.rotation.T + self.translation
+
+    def transform_rotations(self, rotations: Array) -> Array:
+        """cam_from_world rotations (..., 3, 3) of the model as cam_from_reference."""
+        return rotations @ self.rotation.T
 
 
 def center_of(rotations: Array, translations: Array) -> Array:

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from snakesfm.front_ends import LEAST_SIDE_PX
+from snakesfm.geometry.detector_sides import LEAST_SIDE_PX
 from snakesfm.learned.batches import equal_rows
 from snakesfm.learned.checkpoints import fill_network
 from snakesfm.learned.device import load_torch

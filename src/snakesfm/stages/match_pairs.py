@@ -18,7 +18,8 @@ from snakesfm.artifacts.images import ImageIndex
 from snakesfm.artifacts.pairs import ImagePairs, PairCoordinates, PairMatches
 from snakesfm.errors import ImageError
 from snakesfm.features.keypoints import KeypointSet
-from snakesfm.front_ends import DETECTOR_FREE, LEAST_SIDE_PX
+from snakesfm.front_ends import DETECTOR_FREE
+from snakesfm.geometry.detector_sides import LEAST_SIDE_PX
 from snakesfm.learned.batches import cut
 from snakesfm.matching.detector_free import (
     DetectorFreeMatcher,

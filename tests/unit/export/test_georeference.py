@@ -4,9 +4,10 @@ import numpy as np
 import pycolmap
 import pytest
 
-from snakesfm.evaluation.alignment import Similarity, project_to_so3
+from snakesfm.evaluation.alignment import project_to_so3
 from snakesfm.export.georeference import georeference
 from snakesfm.geometry.earth import local_origin
+from snakesfm.geometry.poses import Similarity
 
 ORIGIN = (47.0, 8.0, 500.0)
 
