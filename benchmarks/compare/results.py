@@ -10,6 +10,7 @@ import numpy as np
 from benchmarks.compare.measure import Cost
 from snakesfm.evaluation.colmap_model import model_poses, read_model
 from snakesfm.evaluation.metrics import evaluate_poses, model_metrics
+from snakesfm.grouping import offsets_of
 
 OURS = "snakesfm"
 INCREMENTAL = "colmap_incremental"
@@ -97,7 +98,7 @@ def evaluate(model_folder: Path, reference: Path) -> dict[str, Any]:
     model = read_model(model_folder)
     model.update_point_3d_errors()
     points = [model.points3D[key] for key in sorted(model.points3D)]
-    offsets = np.r_[0, np.cumsum([point.track.length() for point in points], dtype=np.int64)]
+    offsets = offsets_of([point.track.length() for point in points])
     registered = np.array([image.has_pose for image in model.images.values()], dtype=bool)
     errors_px = np.array([point.error for point in points], dtype=np.float64)
     evaluation = evaluate_poses(model_poses(model), model_poses(read_model(reference)))

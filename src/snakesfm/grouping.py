@@ -4,7 +4,7 @@ import math
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[Any]
 
@@ -16,6 +16,16 @@ def rows_of_each(values: Array) -> list[tuple[int, Array]]:
     order = np.argsort(values, kind="stable")
     found, starts = np.unique(values[order], return_index=True)
     return list(zip(found.tolist(), np.split(order, starts[1:]), strict=True))
+
+
+def offsets_of(lengths: ArrayLike) -> Array:
+    """Offsets (n+1,) int64 of groups that follow each other: group k is the rows offsets[k]:offsets[k+1].
+
+    Parameters
+    ----------
+    lengths : (n,) int, rows of each group.
+    """
+    return np.concatenate([[0], np.cumsum(lengths, dtype=np.int64)])
 
 
 def sum_by(values: Array, groups: Array, count: int) -> Array:

@@ -24,6 +24,7 @@ from snakesfm.config.select_pairs import SelectPairsOptions
 from snakesfm.errors import ConfigError, SnakesfmError
 from snakesfm.geometry.camera import Camera, cameras_to_columns
 from snakesfm.geometry.poses import translation_of
+from snakesfm.grouping import offsets_of
 from snakesfm.seeding import derive_seed
 from snakesfm.synthetic.pairing import candidate_pairs, choose_partners, simulate_edge
 from snakesfm.synthetic.sightings import DetectorModel, DistinctLooks, match_looks, sight
@@ -147,7 +148,7 @@ class Simulation:
             sight(self.survey, image, self.options.seed, self.model, described) for image in images.tolist()
         ]
         names = [self.survey.names[image] for image in images]
-        offsets = np.r_[0, np.cumsum([len(s.landmarks) for s in sightings])].astype(np.int64)
+        offsets = offsets_of([len(s.landmarks) for s in sightings])
         size = 128 if described else 0
         LocalFeatures(
             image_ids=images,
@@ -170,7 +171,7 @@ class Simulation:
             image_ids=images,
             offsets=offsets,
             landmarks=_join([s.landmarks for s in sightings], (0,), "int64"),
-            distinct=np.r_[0, np.cumsum([len(d.looks) for d in distinct])].astype(np.int64),
+            distinct=offsets_of([len(d.looks) for d in distinct]),
             looks=_join([d.looks for d in distinct], (0,), "uint64"),
             rows=_join([d.rows for d in distinct], (0,), "int64"),
         )
@@ -210,7 +211,7 @@ class Simulation:
         PairMatches(
             pairs=pairs,
             digests=self._pair_digests("matches", pairs),
-            offsets=np.r_[0, np.cumsum([len(m) for m in matches])].astype(np.int64),
+            offsets=offsets_of([len(m) for m in matches]),
             matches=_join(matches, (0, 2), "int32"),
             scores=_join(scores, (0,), "float32"),
         ).write(self._path("match_pairs", tile), self._header("match_pairs"))
@@ -259,7 +260,7 @@ class Simulation:
             inlier_counts=inlier_counts,
             inlier_ratios=inlier_counts / np.maximum(counts, 1),
             triangulation_angles_deg=angles,
-            offsets=np.r_[0, np.cumsum(inlier_counts)].astype(np.int64),
+            offsets=offsets_of(inlier_counts),
             inliers=_join(inliers, (0, 2), "int32"),
         ).write(self._path("estimate_two_view", tile), self._header("estimate_two_view"))
 

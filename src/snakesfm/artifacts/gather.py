@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from snakesfm.artifacts.features import LocalFeatures
 from snakesfm.artifacts.pairs import REJECTIONS, TwoViewGeometries
+from snakesfm.grouping import offsets_of
 
 Array = NDArray[Any]
 
@@ -93,7 +94,7 @@ def gather_inlier_matches(paths: Sequence[Path], pairs: Array) -> tuple[Array, A
             parts.append(((i, j), inliers[offsets[row] - first : offsets[row + 1] - first]))
     parts.sort(key=lambda part: part[0])
     found = np.array([pair for pair, _ in parts], dtype=np.int32).reshape(-1, 2)
-    starts = np.r_[0, np.cumsum([len(matches) for _, matches in parts])].astype(np.int64)
+    starts = offsets_of([len(matches) for _, matches in parts])
     matches = np.concatenate([matches for _, matches in parts] or [np.zeros((0, 2), dtype=np.int32)])
     return found, starts, matches
 

@@ -55,3 +55,8 @@ class CalibratedCameras(Artifact):
         "overlay covers",
     )
     warnings: Array = column("(W)", "str", "one sentence for each problem found")
+
+    @property
+    def camera_columns(self) -> tuple[Array, Array, Array, Array]:
+        """The arguments of :func:`snakesfm.geometry.camera.cameras_from_columns`."""
+        return self.models, self.sizes, self.params, self.sources

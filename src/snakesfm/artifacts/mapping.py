@@ -6,6 +6,7 @@ from typing import ClassVar
 import numpy as np
 
 from snakesfm.artifacts.base import Array, Artifact, column
+from snakesfm.grouping import offsets_of
 
 
 @dataclass(frozen=True)
@@ -129,7 +130,7 @@ class Reconstruction(Artifact):
             points=self.points[points],
             colors=self.colors[points],
             errors_px=self.errors_px[points],
-            offsets=np.r_[0, np.cumsum(lengths[points])].astype(np.int64),
+            offsets=offsets_of(lengths[points]),
             image_ids=self.image_ids[rows],
             keypoint_ids=self.keypoint_ids[rows],
             keypoints=self.keypoints[rows],

@@ -15,6 +15,7 @@ from snakesfm.geometry.camera import Camera, observation_errors
 from snakesfm.geometry.colmap_binding import pycolmap
 from snakesfm.geometry.colmap_writing import with_observations
 from snakesfm.geometry.poses import to_rigid3d
+from snakesfm.grouping import offsets_of
 
 Array = NDArray[Any]
 
@@ -60,7 +61,7 @@ def restrict_to(model: BundleModel, images: Array) -> BundleModel:
         rotations=np.where(images[:, None, None], model.rotations, np.nan),
         translations=np.where(images[:, None], model.translations, np.nan),
         points=model.points[counts >= 2],
-        offsets=np.r_[0, np.cumsum(lengths)].astype(np.int64),
+        offsets=offsets_of(lengths),
         image_ids=model.image_ids[kept],
         keypoint_ids=model.keypoint_ids[kept],
     )
@@ -129,7 +130,7 @@ def from_reconstruction(
     offsets = np.searchsorted(tracks.point_rows, np.arange(len(tracks.points) + 1))
     rank = np.lexsort((rows[offsets[:-1]], images[offsets[:-1]]))
     lengths = np.diff(offsets)[rank]
-    sorted_offsets = np.r_[0, np.cumsum(lengths)].astype(np.int64)
+    sorted_offsets = offsets_of(lengths)
     take = np.repeat(offsets[:-1][rank] - sorted_offsets[:-1], lengths) + np.arange(len(rows))
     result = BundleModel(
         cameras,

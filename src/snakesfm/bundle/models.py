@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from snakesfm.bundle.model import BundleModel
 from snakesfm.geometry.camera import Camera
+from snakesfm.grouping import offsets_of
 from snakesfm.view_graph.components import label_components
 
 Array = NDArray[Any]
@@ -39,7 +40,7 @@ def join_models(models: Sequence[BundleModel], cameras: tuple[Camera, ...]) -> t
         rotations=rotations,
         translations=translations,
         points=np.concatenate([model.points for model in models]),
-        offsets=np.r_[0, np.cumsum(lengths)].astype(np.int64),
+        offsets=offsets_of(lengths),
         image_ids=np.concatenate([model.image_ids for model in models]),
         keypoint_ids=np.concatenate([model.keypoint_ids for model in models]),
     )

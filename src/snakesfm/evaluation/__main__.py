@@ -10,6 +10,7 @@ import numpy as np
 from snakesfm.errors import SnakesfmError
 from snakesfm.evaluation.colmap_model import model_poses, read_model
 from snakesfm.evaluation.metrics import evaluate_poses, model_metrics
+from snakesfm.grouping import offsets_of
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -30,7 +31,7 @@ def main(arguments: list[str] | None = None) -> int:
     errors = np.array([point.error for point in points], dtype=np.float64)
     evaluation = evaluate_poses(model_poses(model), model_poses(reference))
     content: dict[str, object] = {
-        **model_metrics(registered, np.r_[0, np.cumsum(lengths, dtype=np.int64)], errors),
+        **model_metrics(registered, offsets_of(lengths), errors),
         **evaluation.metrics,
     }
     if options.per_image:

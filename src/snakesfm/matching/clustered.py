@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from snakesfm.grouping import offsets_of
 from snakesfm.matching.nearest import accept, augmented, no_matches, pop_two_largest
 
 Array = NDArray[Any]
@@ -71,7 +72,7 @@ class ClusteredSearch:
             count=len(descriptors),
             centers=centers,
             vectors=vectors[row],
-            offsets=_offsets(word, len(centers)),
+            offsets=offsets_of(np.bincount(word, minlength=len(centers))),
             by_row=by_row,
             owners=owners,
             starts=np.searchsorted(owners, np.arange(len(descriptors))),
@@ -89,7 +90,7 @@ class ClusteredSearch:
         word = _affinities(vectors[:, :-2], self.centers).argmax(axis=1).astype(np.uint8)
         order = np.argsort(word, kind="stable")
         nearest, first, second, column_first = self._compare(
-            vectors[order], _offsets(word, len(self.centers))
+            vectors[order], offsets_of(np.bincount(word, minlength=len(self.centers)))
         )
         # of every descriptor, the best over the words it probed
         values = first[self.by_row]
@@ -148,7 +149,7 @@ def learn_codebook(descriptors: Array, words: int) -> Array:
         word = _affinities(sample, centers).argmax(axis=1)
         sizes = np.bincount(word, minlength=words)
         used = sizes > 0
-        sums = np.add.reduceat(sample[np.argsort(word, kind="stable")], _offsets(word, words)[:-1][used])
+        sums = np.add.reduceat(sample[np.argsort(word, kind="stable")], offsets_of(sizes)[:-1][used])
         centers[used] = sums / sizes[used, None]
         if descriptors.dtype.kind in "ui":
             np.rint(centers, out=centers)
@@ -176,7 +177,3 @@ def _affinities(vectors: Array, centers: Array) -> Array:
     products: Array = vectors @ centers.T
     products -= np.einsum("wd,wd->w", centers, centers) / np.float32(2)
     return products
-
-
-def _offsets(words: Array, count: int) -> Array:
-    return np.concatenate([[0], np.cumsum(np.bincount(words, minlength=count))])

@@ -5,6 +5,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from snakesfm.grouping import offsets_of
+
 Array = NDArray[Any]
 
 ROWS_AT_ONCE = 4096
@@ -84,7 +86,7 @@ def sum_by_word(descriptors: Array, words: Array, word_count: int) -> tuple[Arra
     """Sums (W,D) float64 and counts (W,) int64 of the descriptors (N,D) of each word."""
     counts = np.bincount(words, minlength=word_count)
     order = np.argsort(words, kind="stable")
-    starts = np.concatenate([[0], np.cumsum(counts)])
+    starts = offsets_of(counts)
     sums = np.zeros((word_count, descriptors.shape[1]))
     for word in np.flatnonzero(counts):
         sums[word] = descriptors[order[starts[word] : starts[word + 1]]].sum(axis=0, dtype=np.float64)

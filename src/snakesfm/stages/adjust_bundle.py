@@ -37,6 +37,7 @@ from snakesfm.geometry.detector_pixels import (
     restore_cameras,
 )
 from snakesfm.geometry.poses import translation_of
+from snakesfm.grouping import offsets_of
 from snakesfm.stages.job import StageJob
 from snakesfm.triangulation.tracks import mean_colors
 
@@ -57,8 +58,7 @@ def run(job: StageJob) -> None:
     SceneError : fewer than two images are left.
     """
     index = ImageIndex.read(job.path("index"))
-    columns = CalibratedCameras.read(job.path("cameras"))
-    originals = cameras_from_columns(columns.models, columns.sizes, columns.params, columns.sources)
+    originals = cameras_from_columns(*CalibratedCameras.read(job.path("cameras")).camera_columns)
     averaged = CameraRotations.read(job.path("rotations"))
     centers = CameraCenters.read(job.path("centers")).centers
     poses = BundleModel(
@@ -250,7 +250,7 @@ def _write(
     far: dict[int, float],
 ) -> None:
     (colors,) = gather_image_columns(job.paths("features"), len(model.camera_ids), "colors")
-    base = np.r_[0, np.cumsum([len(k) for k in colors])]
+    base = offsets_of([len(k) for k in colors])
     rows = base[model.image_ids] + model.keypoint_ids
     camera_models, sizes, params, _ = cameras_to_columns(model.cameras)
     ids = range(1, len(model.cameras) + 1)

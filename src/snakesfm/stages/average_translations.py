@@ -42,8 +42,7 @@ def run(job: StageJob) -> None:
     """
     options: AverageTranslationsOptions = job.options
     index = ImageIndex.read(job.path("index"))
-    columns = CalibratedCameras.read(job.path("cameras"))
-    cameras = cameras_from_columns(columns.models, columns.sizes, columns.params, columns.sources)
+    cameras = cameras_from_columns(*CalibratedCameras.read(job.path("cameras")).camera_columns)
     graph = ViewGraph.read(job.path("graph"))
     averaged = CameraRotations.read(job.path("rotations"))
     tracks = TrackTable.read(job.path("tracks"))

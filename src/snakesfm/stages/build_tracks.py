@@ -13,6 +13,7 @@ from snakesfm.artifacts.mapping import CameraRotations, TrackTable
 from snakesfm.artifacts.pairs import PairCoordinates, ViewGraph
 from snakesfm.errors import SceneError
 from snakesfm.geometry.detector_pixels import reduce_all_keypoints
+from snakesfm.grouping import offsets_of
 from snakesfm.stages.job import StageJob
 from snakesfm.tracks.build import build_tracks
 from snakesfm.tracks.merged import compare_track_lengths, describe_lengths
@@ -71,7 +72,7 @@ def run(job: StageJob) -> None:
         )
         print(f"before merging keypoints: {describe_lengths(unmerged)}")
         print(f"after merging keypoints: {describe_lengths(merged)}, before any is split or left out")
-    base = np.r_[0, np.cumsum([len(k) for k in keypoints])]
+    base = offsets_of([len(k) for k in keypoints])
     rows = base[tracks.image_ids] + tracks.keypoint_ids
     TrackTable(
         offsets=tracks.offsets,

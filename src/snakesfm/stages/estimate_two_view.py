@@ -20,6 +20,7 @@ from snakesfm.geometry.detector_pixels import (
     reduce_cameras,
     reduce_keypoints,
 )
+from snakesfm.grouping import offsets_of
 from snakesfm.matching.overlays import find_moving_matches
 from snakesfm.stages.job import StageJob
 from snakesfm.two_view.correspondences import first_rows_at_place, unify_matches
@@ -40,9 +41,7 @@ def run(job: StageJob) -> None:
     options: EstimateTwoViewOptions = job.options
     index = ImageIndex.read(job.path("index"))
     cameras = CalibratedCameras.read(job.path("cameras"))
-    of_camera = reduce_cameras(
-        cameras_from_columns(cameras.models, cameras.sizes, cameras.params, cameras.sources), job.settings
-    )
+    of_camera = reduce_cameras(cameras_from_columns(*cameras.camera_columns), job.settings)
     matches = PairMatches.read(job.path("matches"))
     images = set(matches.pairs.ravel().tolist())
     found, image_digests = gather_keypoints(job.paths("features"), images)
@@ -171,7 +170,7 @@ def _assemble(pairs: Array, rows: list[Row]) -> TwoViewGeometries:
     return TwoViewGeometries(
         pairs=pairs,
         digests=np.array([row["digests"] for row in rows], dtype=object),
-        offsets=np.concatenate([[0], np.cumsum(counts)]).astype(np.int64),
+        offsets=offsets_of(counts),
         inliers=np.concatenate(inliers) if inliers else np.zeros((0, 2), dtype=np.int32),
         **columns,
     )

@@ -33,8 +33,7 @@ def run(job: StageJob) -> None:
 
     options: ExportDatabaseOptions = job.options
     index = ImageIndex.read(job.path("index"))
-    columns = CalibratedCameras.read(job.path("cameras"))
-    cameras = cameras_from_columns(columns.models, columns.sizes, columns.params, columns.sources)
+    cameras = cameras_from_columns(*CalibratedCameras.read(job.path("cameras")).camera_columns)
     folder = job.output.parent
     folder.mkdir(parents=True, exist_ok=True)
     for leftover in folder.glob(f"{TEMPORARY}*"):

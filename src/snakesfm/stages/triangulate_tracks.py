@@ -10,6 +10,7 @@ from snakesfm.errors import SceneError
 from snakesfm.geometry.camera import cameras_from_columns
 from snakesfm.geometry.detector_pixels import detector_scales, reduce_cameras
 from snakesfm.geometry.poses import translation_of
+from snakesfm.grouping import offsets_of
 from snakesfm.stages.job import StageJob
 from snakesfm.triangulation.interface import TriangulationLimits
 from snakesfm.triangulation.tracks import mean_colors, triangulate_tracks
@@ -27,8 +28,7 @@ def run(job: StageJob) -> None:
     """
     options: TriangulateTracksOptions = job.options
     index = ImageIndex.read(job.path("index"))
-    columns = CalibratedCameras.read(job.path("cameras"))
-    cameras = cameras_from_columns(columns.models, columns.sizes, columns.params, columns.sources)
+    cameras = cameras_from_columns(*CalibratedCameras.read(job.path("cameras")).camera_columns)
     rotations = CameraRotations.read(job.path("rotations")).rotations
     centers = CameraCenters.read(job.path("centers")).centers
     tracks = TrackTable.read(job.path("tracks"))
@@ -58,7 +58,7 @@ def run(job: StageJob) -> None:
             "check the cameras' focal lengths, or raise triangulate_tracks.max_reprojection_error_px."
         )
     lengths = np.add.reduceat(kept.astype(np.int64), tracks.offsets[:-1])[good]
-    offsets = np.r_[0, np.cumsum(lengths)].astype(np.int64)
+    offsets = offsets_of(lengths)
     print(f"{good.sum()} points of {count} tracks, {kept.sum()} of {len(kept)} observations")
     TriangulatedPoints(
         points=points[good],

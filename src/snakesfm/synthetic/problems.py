@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from snakesfm.geometry.camera import Camera
 from snakesfm.geometry.poses import translation_of
 from snakesfm.geometry.rotations import exp_so3
+from snakesfm.grouping import offsets_of
 from snakesfm.synthetic.layouts import LAYOUTS
 
 Array = NDArray[Any]
@@ -85,7 +86,7 @@ class SyntheticProblem:
     @property
     def track_keypoints(self) -> Array:
         """(L,2) float32 measured pixels of the observations."""
-        starts = np.concatenate([[0], np.cumsum([len(k) for k in self.keypoints])])
+        starts = offsets_of([len(k) for k in self.keypoints])
         flat = np.concatenate([np.zeros((0, 2), np.float32), *self.keypoints])
         return np.asarray(flat[starts[self.track_image_ids] + self.track_keypoint_ids])
 
@@ -262,7 +263,7 @@ def _choose_views(
     distance *= rng.uniform(0.7, 1.3, len(distance))
     wanted = np.minimum(1 + rng.geometric(0.25, len(points)), max_views)
     order = np.lexsort((distance, group))
-    starts = np.concatenate([[0], np.cumsum(counts)])[:-1]
+    starts = offsets_of(counts)[:-1]
     rank = np.arange(len(order)) - starts[group[order]]
     keep = (rank < wanted[group[order]]) & (counts[group[order]] >= 2)
     return np.asarray(np.sort(order[keep]))
@@ -276,7 +277,7 @@ def _shared_observations(
     Observations come sorted by point, then image.
     """
     lengths = np.bincount(point_ids, minlength=point_count)
-    position = np.arange(len(point_ids)) - np.concatenate([[0], np.cumsum(lengths)])[:-1][point_ids]
+    position = np.arange(len(point_ids)) - offsets_of(lengths)[:-1][point_ids]
     lefts, rights = [], []
     for gap in range(1, int(lengths.max(initial=1))):
         rows = np.flatnonzero(position + gap < lengths[point_ids])
@@ -291,7 +292,7 @@ def _shared_observations(
     enough = counts >= min_shared
     keep = enough[inverse]
     pairs = np.stack([unique[enough] // image_count, unique[enough] % image_count], axis=1).astype(np.int32)
-    offsets = np.concatenate([[0], np.cumsum(counts[enough])]).astype(np.int64)
+    offsets = offsets_of(counts[enough])
     return pairs, offsets, left[keep], right[keep]
 
 
@@ -303,7 +304,7 @@ def _pair_angles_deg(points: Array, centers: Array, pairs: Array, edge_of_match:
     angles = np.degrees(2.0 * np.arcsin(np.minimum(chord / 2.0, 1.0)))
     order = np.lexsort((angles, edge_of_match))
     counts = np.bincount(edge_of_match, minlength=len(pairs))
-    middles = np.concatenate([[0], np.cumsum(counts)])[:-1] + counts // 2
+    middles = offsets_of(counts)[:-1] + counts // 2
     return np.asarray(angles[order][middles])
 
 

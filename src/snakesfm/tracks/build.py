@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from snakesfm.grouping import components_of
+from snakesfm.grouping import components_of, offsets_of
 from snakesfm.tracks.split import cycle_support, split_conflicts, unconfirmed_links
 
 Array = NDArray[Any]
@@ -65,7 +65,7 @@ def build_tracks(
     -------
     Tracks sorted by their first observation.
     """
-    base = np.r_[0, np.cumsum([len(k) for k in keypoints])].astype(np.int64)
+    base = offsets_of([len(k) for k in keypoints])
     counts = np.diff(offsets)
     pair_of = np.repeat(np.arange(len(pairs)), counts)
     links = np.stack([base[pairs[pair_of, side]] + matches[:, side] for side in (0, 1)], axis=1)

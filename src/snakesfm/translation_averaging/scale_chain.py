@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from snakesfm.geometry.sparse_systems import solve_spd
-from snakesfm.grouping import components_of, sum_by
+from snakesfm.grouping import components_of, offsets_of, sum_by
 from snakesfm.translation_averaging.clusters import join_clusters
 from snakesfm.translation_averaging.problem import PositioningProblem
 
@@ -26,7 +26,7 @@ def shared_rays(problem: PositioningProblem) -> tuple[Array, Array, Array]:
     """Every landmark that both cameras of an edge see: edge (S), ray rows in images i (S) and j (S)."""
     count = problem.image_count
     _, lengths = np.unique(problem.ray_tracks, return_counts=True)
-    starts = np.concatenate([[0], np.cumsum(lengths)])[:-1]
+    starts = offsets_of(lengths)[:-1]
     row_length = np.repeat(lengths, lengths)
     position = np.arange(len(problem.ray_tracks)) - np.repeat(starts, lengths)
     keys = problem.pairs[:, 0] * count + problem.pairs[:, 1]

@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from snakesfm.grouping import offsets_of
 from snakesfm.triangulation.interface import TriangulationLimits, TriangulationProblem, check_points
 
 Array = NDArray[Any]
@@ -43,7 +44,7 @@ def hypotheses_of(length: int, limits: TriangulationLimits) -> Array:
         rng = np.random.default_rng((limits.seed, length))
         rows = np.sort(rng.choice(total, limits.max_hypotheses, replace=False))
     # the list of all pairs would grow with the square of the length, of each length that occurs
-    starts = np.r_[0, np.cumsum(np.arange(length - 1, 0, -1))]
+    starts = offsets_of(np.arange(length - 1, 0, -1))
     first = np.searchsorted(starts, rows, side="right") - 1
     return np.stack([first, rows - starts[first] + first + 1], axis=1)
 

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from snakesfm.geometry.camera import Camera, undistort
+from snakesfm.grouping import offsets_of
 from snakesfm.triangulation.interface import TriangulationLimits, TriangulationProblem, Triangulator
 
 Array = NDArray[Any]
@@ -61,7 +62,7 @@ def triangulate_tracks(
     lengths = np.bincount(track_of[usable], minlength=len(offsets) - 1)
     focals = np.array([camera.focal_px for camera in cameras])[camera_ids]
     problem = TriangulationProblem(
-        rotations, translations, focals, np.r_[0, np.cumsum(lengths)], image_ids[usable], rays[usable]
+        rotations, translations, focals, offsets_of(lengths), image_ids[usable], rays[usable]
     )
     points, inliers = triangulator(method)(problem, limits)
     kept = np.zeros(len(image_ids), dtype=bool)
