@@ -31,8 +31,8 @@ def look_at(centers: Array, targets: Array, up: Array) -> Array:
     return np.stack([right, np.cross(forward, right), forward], axis=1)
 
 
-def _wobble(rotations: Array, angle_deg: float, rng: np.random.Generator) -> Array:
-    """A hand-held camera's deviations from the ideal viewing direction."""
+def wobble(rotations: Array, angle_deg: float, rng: np.random.Generator) -> Array:
+    """Rotations (N,3,3) turned by Gaussian angles about each axis, as those of a hand-held camera are."""
     return np.asarray(exp_so3(rng.normal(0.0, np.radians(angle_deg), (len(rotations), 3))) @ rotations)
 
 
@@ -46,7 +46,7 @@ def ring(camera_count: int, point_count: int, rng: np.random.Generator) -> Scene
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     points = normals * (0.4 * radius * rng.uniform(0.7, 1.1, (point_count, 1)))
     rotations = look_at(centers, np.zeros(3), np.array([0.0, 0.0, 1.0]))
-    return Scene(_wobble(rotations, 3.0, rng), centers, points, normals)
+    return Scene(wobble(rotations, 3.0, rng), centers, points, normals)
 
 
 def street(camera_count: int, point_count: int, rng: np.random.Generator) -> Scene:
@@ -71,7 +71,7 @@ def street(camera_count: int, point_count: int, rng: np.random.Generator) -> Sce
         on_road[:, None], [0.0, 0.0, 1.0], facing / np.linalg.norm(facing, axis=1, keepdims=True)
     )
     rotations = look_at(centers, centers + np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.0, 1.0]))
-    return Scene(_wobble(rotations, 4.0, rng), centers, points, normals)
+    return Scene(wobble(rotations, 4.0, rng), centers, points, normals)
 
 
 def area(camera_count: int, point_count: int, rng: np.random.Generator) -> Scene:
@@ -90,7 +90,7 @@ def area(camera_count: int, point_count: int, rng: np.random.Generator) -> Scene
     heading = rng.uniform(0.0, 2.0 * np.pi, camera_count)
     up = np.stack([np.cos(heading), np.sin(heading), np.zeros(camera_count)], axis=1)
     rotations = look_at(centers, centers - np.array([0.0, 0.0, 1.0]), up)
-    return Scene(_wobble(rotations, 8.0, rng), centers, points, normals)
+    return Scene(wobble(rotations, 8.0, rng), centers, points, normals)
 
 
 def facade(camera_count: int, point_count: int, rng: np.random.Generator) -> Scene:
@@ -108,7 +108,7 @@ def facade(camera_count: int, point_count: int, rng: np.random.Generator) -> Sce
     )
     normals = np.tile([0.0, -1.0, 0.0], (point_count, 1))
     rotations = look_at(centers, centers + np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0]))
-    return Scene(_wobble(rotations, 7.0, rng), centers, points, normals)
+    return Scene(wobble(rotations, 7.0, rng), centers, points, normals)
 
 
 LAYOUTS: dict[str, Callable[[int, int, np.random.Generator], Scene]] = {

@@ -13,8 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from snakesfm.geometry.camera import Camera
-from snakesfm.geometry.rotations import exp_so3
-from snakesfm.synthetic.layouts import look_at
+from snakesfm.synthetic.layouts import look_at, wobble
 
 Array = NDArray[Any]
 
@@ -288,12 +287,6 @@ class StreetSurvey:
 
 
 SURVEYS: dict[str, Callable[[int, int], Survey]] = {"aerial": AerialSurvey, "street": StreetSurvey}
-
-
-def wobble(rotations: Array, angle_deg: float, rng: np.random.Generator) -> Array:
-    """Rotations (N,3,3) turned by Gaussian angles about each axis."""
-    turns = exp_so3(rng.normal(0.0, np.radians(angle_deg), (len(rotations), 3)))
-    return np.asarray(turns @ rotations)
 
 
 def pairs_within(places: Array, radius: float) -> Array:
