@@ -8,7 +8,7 @@ from contracts.test_detectors import shapes
 
 from snakesfm.evaluation.colmap_model import read_model
 from snakesfm.features.virtual import VirtualKeypoints
-from snakesfm.matching.detector_free import DETECTOR_FREE_MATCHERS, Picture, create_detector_free
+from snakesfm.matching.detector_free import DETECTOR_FREE_MATCHERS, Picture
 from snakesfm.matching.loftr import shrink
 from snakesfm.synthetic.render_demo import make_demo
 from snakesfm.synthetic.scene import DemoOptions
@@ -75,8 +75,8 @@ class TestLoftr(DetectorFreeContract):
         pytest.importorskip("kornia", reason="the extra 'deep' is not installed")
         if not self.made:
             torch.manual_seed(1)
-            self.made["loftr"] = create_detector_free(
-                "loftr", min_score=0.0, longer_side_px=128, state=None
+            self.made["loftr"] = DETECTOR_FREE_MATCHERS["loftr"](
+                min_score=0.0, longer_side_px=128, state=None
             )
         return self.made["loftr"]
 
@@ -151,8 +151,8 @@ class TestVirtualPlaces(DetectorFreeContract):
 
     @pytest.fixture
     def matcher(self, model):
-        return create_detector_free(
-            "virtual_places", model=model, spread_px=self.spread_px, noise_px=self.noise_px, seed=1
+        return DETECTOR_FREE_MATCHERS["virtual_places"](
+            model=model, spread_px=self.spread_px, noise_px=self.noise_px, seed=1
         )
 
     @pytest.fixture

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from snakesfm.features.extraction import DETECTORS, create_detector, extract_keypoints
+from snakesfm.features.extraction import DETECTORS, extract_keypoints
 
 
 def blobs(width=320, height=240, seed=3):
@@ -52,7 +52,7 @@ class DetectorContract:
 
     @pytest.fixture
     def detector(self):
-        return create_detector(self.method, **self.options)
+        return DETECTORS[self.method](**self.options)
 
     def test_is_registered(self):
         assert self.method in DETECTORS

@@ -9,7 +9,7 @@ from random_weights import megaloc_state, write_netvlad
 from snakesfm.errors import ConfigError
 from snakesfm.learned.checkpoints import read_checkpoint
 from snakesfm.learned.weights import WEIGHT_FILES
-from snakesfm.retrieval.descriptor import DESCRIPTORS, create_descriptor, describe_batch
+from snakesfm.retrieval.descriptor import DESCRIPTORS, describe_batch
 
 
 def colored(width=96, height=70, seed=3):
@@ -37,7 +37,7 @@ class GlobalDescriptorContract:
 
     @pytest.fixture
     def descriptor(self, state):
-        return create_descriptor(self.method, state=state)
+        return DESCRIPTORS[self.method](state=state)
 
     def test_is_registered(self, descriptor):
         assert self.method in DESCRIPTORS
@@ -78,7 +78,7 @@ class GlobalDescriptorContract:
 
     def test_weights_of_another_network_are_refused(self, state):
         with pytest.raises(ConfigError, match="fetch the right ones"):
-            create_descriptor(self.method, state=dict(list(state.items())[:5]))
+            DESCRIPTORS[self.method](state=dict(list(state.items())[:5]))
 
 
 class TestNetvlad(GlobalDescriptorContract):

@@ -8,7 +8,7 @@ import pytest
 from contracts.test_detectors import DetectorContract, extract, shapes
 
 from snakesfm.errors import ConfigError
-from snakesfm.features.extraction import create_detector, extract_keypoints
+from snakesfm.features.extraction import DETECTORS, extract_keypoints
 from snakesfm.learned.checkpoints import read_checkpoint
 
 
@@ -31,7 +31,7 @@ class LearnedDetectorContract(DetectorContract):
     def detector(self, weights):
         if self.method not in self.detectors:
             state = read_checkpoint(self.method, weights, "fetch")
-            self.detectors[self.method] = create_detector(self.method, state=state)
+            self.detectors[self.method] = DETECTORS[self.method](state=state)
         return self.detectors[self.method]
 
     def test_descriptors_are_of_unit_length(self, detector):
@@ -71,14 +71,14 @@ class LearnedDetectorContract(DetectorContract):
                 same_keypoints(found, apart[row])
 
     def test_random_weights_run_through(self, weights):
-        found = create_detector(self.method, state=None).detect(*shapes(64, 96), 50)
+        found = DETECTORS[self.method](state=None).detect(*shapes(64, 96), 50)
         assert found.descriptors.dtype == np.float16
         assert found.keypoints.shape == (len(found), 2)
 
     def test_weights_of_another_network_are_refused(self, weights):
         other = "disk" if self.method != "disk" else "xfeat"
         with pytest.raises(ConfigError, match="fetch the right ones"):
-            create_detector(self.method, state=read_checkpoint(other, weights, "fetch"))
+            DETECTORS[self.method](state=read_checkpoint(other, weights, "fetch"))
 
 
 class TestAliked(LearnedDetectorContract):
@@ -118,7 +118,7 @@ class TestSuperpointOfRandomWeights(DetectorContract):
             import torch
 
             torch.manual_seed(0)
-            self.made.append(create_detector(self.method, state=None))
+            self.made.append(DETECTORS[self.method](state=None))
         return self.made[0]
 
     def test_the_first_pixel_has_its_centre_at_a_half(self, detector, monkeypatch):
@@ -144,7 +144,7 @@ class TestSuperpointOfRandomWeights(DetectorContract):
         from safetensors.torch import save_file
 
         save_file(detector._network.state_dict(), tmp_path / "superpoint.safetensors")
-        again = create_detector(self.method, state=read_checkpoint(self.method, tmp_path, "fetch"))
+        again = DETECTORS[self.method](state=read_checkpoint(self.method, tmp_path, "fetch"))
         one, other = (extract(d, *shapes(), 50, 760) for d in (detector, again))
         np.testing.assert_array_equal(one.descriptors, other.descriptors)
         (tmp_path / "superpoint.safetensors").write_bytes(b"damaged")

@@ -8,10 +8,10 @@ import pytest
 from contracts.test_detectors import extract, shapes
 
 from snakesfm.errors import ConfigError
-from snakesfm.features.extraction import create_detector
+from snakesfm.features.extraction import DETECTORS
 from snakesfm.features.keypoints import KeypointSet
 from snakesfm.learned.checkpoints import read_checkpoint
-from snakesfm.matching.matcher import MATCHERS, create_matcher
+from snakesfm.matching.matcher import MATCHERS
 
 # a view of the picture from elsewhere: turned a little, smaller and in perspective
 VIEW = np.array([[0.9, -0.12, 30], [0.1, 0.92, -12], [1e-4, -2e-4, 1.0]])
@@ -30,16 +30,14 @@ class LearnedMatcherContract:
         key = (self.method, self.detector)
         if key not in self.made:
             state = read_checkpoint(f"{self.detector}_{self.method}", weights, "fetch")
-            self.made[key] = create_matcher(self.method, detector=self.detector, min_score=0.1, state=state)
+            self.made[key] = MATCHERS[self.method](detector=self.detector, min_score=0.1, state=state)
         return self.made[key]
 
     @pytest.fixture
     def images(self, weights):
         """Keypoints of a picture, of a view of it, and of another picture."""
         if self.detector not in self.made:
-            detector = create_detector(
-                self.detector, state=read_checkpoint(self.detector, weights, "fetch")
-            )
+            detector = DETECTORS[self.detector](state=read_checkpoint(self.detector, weights, "fetch"))
             gray, _ = shapes(400, 300)
             # the homography maps coordinates whose first pixel's centre is (0, 0)
             pictures = [gray, cv2.warpPerspective(gray, VIEW, (400, 300)), shapes(400, 300, seed=9)[0]]
@@ -95,7 +93,7 @@ class LearnedMatcherContract:
         assert len(same) > 0.95 * max(len(before), len(after))
 
     def test_random_weights_run_through(self, images):
-        matcher = create_matcher(self.method, detector=self.detector, min_score=0.0, state=None)
+        matcher = MATCHERS[self.method](detector=self.detector, min_score=0.0, state=None)
         matches, scores = matcher.match(matcher.prepare(images[0]), matcher.prepare_second(images[1]))
         assert matches.shape == (len(scores), 2)
 
@@ -124,7 +122,7 @@ def test_superglue_gives_in_a_batch_what_it_gives_alone_in_any_order():
     torch = pytest.importorskip("torch", reason="the extra 'deep' is not installed")
     pytest.importorskip("transformers", reason="the extra 'deep' is not installed")
     torch.manual_seed(0)
-    matcher = create_matcher("superglue", detector="superpoint", min_score=0.0, state=None)
+    matcher = MATCHERS["superglue"](detector="superpoint", min_score=0.0, state=None)
     counts = [(40, 25), (30, 40), (1, 40), (40, 40), (20, 20), (0, 5)]
     pairs = [
         tuple(
@@ -155,7 +153,7 @@ class TestSuperpointMatchersOfRandomWeights:
             import torch
 
             torch.manual_seed(0)
-            self.made[method] = create_matcher(method, detector="superpoint", min_score=0.0, state=None)
+            self.made[method] = MATCHERS[method](detector="superpoint", min_score=0.0, state=None)
         return self.made[method]
 
     @staticmethod

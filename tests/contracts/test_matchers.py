@@ -7,7 +7,7 @@ import pytest
 
 from snakesfm.features.keypoints import KeypointSet
 from snakesfm.features.sift import rootsift
-from snakesfm.matching.matcher import MATCHERS, create_matcher
+from snakesfm.matching.matcher import MATCHERS
 
 
 def keypoints(descriptors, seed=0):
@@ -35,7 +35,7 @@ class MatcherContract:
 
     @pytest.fixture
     def match(self):
-        matcher = create_matcher(self.method, **self.options)
+        matcher = MATCHERS[self.method](**self.options)
         return lambda first, second: matcher.match(matcher.prepare(first), matcher.prepare_second(second))
 
     def test_is_registered(self):
@@ -77,7 +77,7 @@ class MatcherContract:
         assert len(np.unique(matches[:, 0])) == len(matches) == len(np.unique(matches[:, 1]))
 
     def test_a_prepared_image_serves_any_number_of_pairs(self):
-        matcher = create_matcher(self.method, **self.options)
+        matcher = MATCHERS[self.method](**self.options)
         images = [keypoints(rootsift(histograms(count, 1))) for count in (500, 300, 700, 400)]
         prepared = matcher.prepare(images[0])
         for second in (*images, *images[::-1]):
@@ -108,7 +108,7 @@ class MutualRatioContract(MatcherContract):
         second = keypoints(rootsift(histograms(300, 1) + histograms(300, 9)))
         found = []
         for ratio in (0.7, 0.8, 0.9, 1.0):
-            matcher = create_matcher("mutual_ratio", **self.options, max_ratio=ratio)
+            matcher = MATCHERS["mutual_ratio"](**self.options, max_ratio=ratio)
             found.append(
                 set(
                     map(
@@ -131,7 +131,7 @@ class TestExactMutualRatio(MutualRatioContract):
         ordered = np.sort(distance, axis=1)
         nearest = distance.argmin(axis=1)
         good = (ordered[:, 0] <= 0.8 * ordered[:, 1]) & (distance.argmin(axis=0)[nearest] == np.arange(613))
-        matcher = create_matcher("mutual_ratio", search="exact", max_ratio=0.8)
+        matcher = MATCHERS["mutual_ratio"](search="exact", max_ratio=0.8)
         matches, scores = matcher.match(
             matcher.prepare(keypoints(first)), matcher.prepare_second(keypoints(second.astype(np.uint8)))
         )

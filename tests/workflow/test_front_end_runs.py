@@ -135,14 +135,14 @@ def write_random_superpoint(folder: Path, matcher: str) -> None:
     pytest.importorskip("transformers", reason="the extra 'deep' is not installed")
     from safetensors.torch import save_file
 
-    from snakesfm.features.extraction import create_detector
-    from snakesfm.matching.matcher import create_matcher
+    from snakesfm.features.extraction import DETECTORS
+    from snakesfm.matching.matcher import MATCHERS
 
     folder.mkdir()
     torch.manual_seed(0)
     networks = {
-        "superpoint": create_detector("superpoint", state=None),
-        f"superpoint_{matcher}": create_matcher(matcher, detector="superpoint", min_score=0.0, state=None),
+        "superpoint": DETECTORS["superpoint"](state=None),
+        f"superpoint_{matcher}": MATCHERS[matcher](detector="superpoint", min_score=0.0, state=None),
     }
     for model, made in networks.items():
         path = folder / WEIGHT_FILES[model].name
@@ -241,11 +241,11 @@ def test_places_found_pair_by_pair_are_merged(
 def test_loftr_runs_through_with_random_weights(small_scene: Path, workflow: Workflow) -> None:
     torch = pytest.importorskip("torch", reason="the extra 'deep' is not installed")
     pytest.importorskip("kornia", reason="the extra 'deep' is not installed")
-    from snakesfm.matching.detector_free import create_detector_free
+    from snakesfm.matching.detector_free import DETECTOR_FREE_MATCHERS
 
     (workflow.folder / "weights").mkdir()
     torch.manual_seed(1)
-    network = create_detector_free("loftr", min_score=0.0, longer_side_px=128, state=None)._network
+    network = DETECTOR_FREE_MATCHERS["loftr"](min_score=0.0, longer_side_px=128, state=None)._network
     torch.save({"state_dict": network.state_dict()}, workflow.folder / "weights" / "loftr_outdoor.ckpt")
     outcome = workflow.run(
         "--until",

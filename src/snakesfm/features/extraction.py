@@ -1,6 +1,5 @@
 """From an image to its strongest keypoints."""
 
-import importlib
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -12,6 +11,7 @@ from numpy.typing import NDArray
 from snakesfm.features.keypoints import BatchDetector, Detector, KeypointSet, pixels_at
 from snakesfm.features.sift import SiftDetector
 from snakesfm.ingest.read import scale_down
+from snakesfm.lazy_loading import lazy
 
 Array = NDArray[Any]
 
@@ -19,29 +19,13 @@ Array = NDArray[Any]
 SMALLEST_SHARE = 0.25
 
 
-def _learned(name: str) -> Callable[..., Detector]:
-    """A detector of features.learned, whose libraries load when one is made."""
-
-    def make(**options: Any) -> Detector:
-        module = importlib.import_module("snakesfm.features.learned")
-        detector: Detector = getattr(module, name)(**options)
-        return detector
-
-    return make
-
-
 DETECTORS: dict[str, Callable[..., Detector]] = {
     "sift": SiftDetector,
-    "aliked": _learned("AlikedDetector"),
-    "disk": _learned("DiskDetector"),
-    "xfeat": _learned("XfeatDetector"),
-    "superpoint": _learned("SuperpointDetector"),
+    "aliked": lazy("features.learned", "AlikedDetector"),
+    "disk": lazy("features.learned", "DiskDetector"),
+    "xfeat": lazy("features.learned", "XfeatDetector"),
+    "superpoint": lazy("features.learned", "SuperpointDetector"),
 }
-
-
-def create_detector(method: str, **options: Any) -> Detector:
-    """The detector of a name in ``DETECTORS``, with its own options."""
-    return DETECTORS[method](**options)
 
 
 def extract_keypoints(

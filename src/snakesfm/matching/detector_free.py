@@ -1,12 +1,13 @@
 """The interface of matchers without keypoints."""
 
-import importlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+
+from snakesfm.lazy_loading import lazy
 
 Array = NDArray[Any]
 
@@ -56,24 +57,7 @@ def no_coordinates() -> tuple[Array, Array]:
     return np.zeros((0, 4), np.float32), np.zeros(0, np.float32)
 
 
-def _lazy(module: str, name: str) -> Callable[..., DetectorFreeMatcher]:
-    """A matcher whose libraries load when one is made."""
-
-    def make(**options: Any) -> DetectorFreeMatcher:
-        made: DetectorFreeMatcher = getattr(importlib.import_module(f"snakesfm.matching.{module}"), name)(
-            **options
-        )
-        return made
-
-    return make
-
-
 DETECTOR_FREE_MATCHERS: dict[str, Callable[..., DetectorFreeMatcher]] = {
-    "loftr": _lazy("loftr", "LoftrMatcher"),
-    "virtual_places": _lazy("virtual_places", "VirtualPlaces"),
+    "loftr": lazy("matching.loftr", "LoftrMatcher"),
+    "virtual_places": lazy("matching.virtual_places", "VirtualPlaces"),
 }
-
-
-def create_detector_free(method: str, **options: Any) -> DetectorFreeMatcher:
-    """The matcher of a name in ``DETECTOR_FREE_MATCHERS``, with its own options."""
-    return DETECTOR_FREE_MATCHERS[method](**options)

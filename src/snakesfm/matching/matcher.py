@@ -1,6 +1,5 @@
 """The interface of matchers."""
 
-import importlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, Protocol, runtime_checkable
@@ -8,6 +7,7 @@ from typing import Any, Literal, Protocol, runtime_checkable
 from numpy.typing import NDArray
 
 from snakesfm.features.keypoints import KeypointSet
+from snakesfm.lazy_loading import lazy
 from snakesfm.matching.clustered import ClusteredSearch
 from snakesfm.matching.identity import IdentityMatcher
 from snakesfm.matching.nearest import ExactSearch
@@ -73,24 +73,9 @@ class MutualRatioMatcher:
         return first.match(second, self.max_ratio)
 
 
-def _learned(module: str, name: str) -> Callable[..., Matcher]:
-    """A matcher whose libraries load when one is made."""
-
-    def make(**options: Any) -> Matcher:
-        matcher: Matcher = getattr(importlib.import_module(f"snakesfm.matching.{module}"), name)(**options)
-        return matcher
-
-    return make
-
-
 MATCHERS: dict[str, Callable[..., Matcher]] = {
     "mutual_ratio": MutualRatioMatcher,
     "virtual": IdentityMatcher,
-    "lightglue": _learned("lightglue", "LightglueMatcher"),
-    "superglue": _learned("superglue", "SuperglueMatcher"),
+    "lightglue": lazy("matching.lightglue", "LightglueMatcher"),
+    "superglue": lazy("matching.superglue", "SuperglueMatcher"),
 }
-
-
-def create_matcher(method: str, **options: Any) -> Matcher:
-    """The matcher of a name in ``MATCHERS``, with its own options."""
-    return MATCHERS[method](**options)

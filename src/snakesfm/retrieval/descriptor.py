@@ -1,12 +1,12 @@
 """The interface of networks that summarise an image in one vector."""
 
-import importlib
 from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from snakesfm.lazy_loading import lazy
 from snakesfm.learned.batches import equal_rows
 from snakesfm.learned.device import load_torch
 from snakesfm.learned.pictures import to_array, to_tensor
@@ -79,24 +79,7 @@ def _shrink(rgb: Array, longer_side_px: int, descriptor: GlobalDescriptor) -> Ar
     return small
 
 
-def _lazy(module: str, name: str) -> Callable[..., GlobalDescriptor]:
-    """A descriptor whose libraries load when one is made."""
-
-    def make(**options: Any) -> GlobalDescriptor:
-        made: GlobalDescriptor = getattr(importlib.import_module(f"snakesfm.retrieval.{module}"), name)(
-            **options
-        )
-        return made
-
-    return make
-
-
 DESCRIPTORS: dict[str, Callable[..., GlobalDescriptor]] = {
-    "netvlad": _lazy("netvlad", "NetvladDescriptor"),
-    "megaloc": _lazy("megaloc", "MegalocDescriptor"),
+    "netvlad": lazy("retrieval.netvlad", "NetvladDescriptor"),
+    "megaloc": lazy("retrieval.megaloc", "MegalocDescriptor"),
 }
-
-
-def create_descriptor(method: str, **options: Any) -> GlobalDescriptor:
-    """The descriptor of a name in ``DESCRIPTORS``, with its weights as ``state``."""
-    return DESCRIPTORS[method](**options)

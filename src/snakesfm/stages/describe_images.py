@@ -12,7 +12,7 @@ from snakesfm.artifacts.images import ImageIndex
 from snakesfm.errors import ImageError
 from snakesfm.learned.batches import in_batches
 from snakesfm.retrieval.codebook import largest_rows
-from snakesfm.retrieval.descriptor import create_descriptor, describe_batch
+from snakesfm.retrieval.descriptor import DESCRIPTORS, describe_batch
 from snakesfm.retrieval.vlad import describe_vlad
 from snakesfm.stages.job import StageJob
 
@@ -52,7 +52,7 @@ def _describe_pictures(job: StageJob, options: "DescribeImagesOptions") -> tuple
 
     index = ImageIndex.read(job.paths("index")[0])
     image_ids = np.flatnonzero(index.blocks == int(job.settings["block"]))
-    descriptor = create_descriptor(options.method, state=job.read_weights(options.method))
+    descriptor = DESCRIPTORS[options.method](state=job.read_weights(options.method))
     side = descriptor.usual_side_px if options.longer_side_px == "auto" else options.longer_side_px
     described = np.zeros((len(image_ids), descriptor.size), np.float32)
     progress = job.progress(len(image_ids), "images")

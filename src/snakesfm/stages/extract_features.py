@@ -21,7 +21,7 @@ from snakesfm.artifacts.hloc import (
 from snakesfm.artifacts.images import ImageIndex
 from snakesfm.digests import file_digest
 from snakesfm.errors import ConfigError, ImageError
-from snakesfm.features.extraction import create_detector, extract_keypoints, sample_colors
+from snakesfm.features.extraction import DETECTORS, extract_keypoints, sample_colors
 from snakesfm.features.keypoints import Detector, KeypointSet, KeypointSource
 from snakesfm.ingest.masks import find_mask, read_mask
 from snakesfm.ingest.read import read_image
@@ -114,13 +114,12 @@ def _create_finder(job: StageJob, options: "ExtractFeaturesOptions") -> Detector
     if options.method == "imported":
         return ImportedKeypoints(Path(job.settings["imported"]) / FEATURES)
     if options.method == "sift":
-        return create_detector(
-            "sift",
+        return DETECTORS["sift"](
             contrast_threshold=options.contrast_threshold,
             edge_threshold=options.edge_threshold,
             upright=options.upright,
         )
-    return create_detector(options.method, state=job.read_weights(options.method))
+    return DETECTORS[options.method](state=job.read_weights(options.method))
 
 
 class ImportedKeypoints:

@@ -22,12 +22,12 @@ from snakesfm.front_ends import DETECTOR_FREE
 from snakesfm.geometry.detector_sides import LEAST_SIDE_PX
 from snakesfm.learned.batches import cut
 from snakesfm.matching.detector_free import (
+    DETECTOR_FREE_MATCHERS,
     DetectorFreeMatcher,
     Picture,
-    create_detector_free,
     no_coordinates,
 )
-from snakesfm.matching.matcher import BatchMatcher, Matcher, create_matcher
+from snakesfm.matching.matcher import MATCHERS, BatchMatcher, Matcher
 from snakesfm.matching.nearest import no_matches
 from snakesfm.stages.job import StageJob
 
@@ -98,13 +98,12 @@ def _create_matcher(job: StageJob, options: "MatchPairsOptions") -> Matcher:
     if options.method == "imported":
         return ImportedMatches(Path(job.settings["imported"]) / MATCHES)
     if options.method == "virtual":
-        return create_matcher("virtual")
+        return MATCHERS["virtual"]()
     if options.method == "mutual_ratio":
         names = {"max_ratio", "search", "words", "probes"}
-        return create_matcher("mutual_ratio", **options.model_dump(include=names))
+        return MATCHERS["mutual_ratio"](**options.model_dump(include=names))
     detector = str(job.settings.get("detector", "sift"))
-    return create_matcher(
-        options.method,
+    return MATCHERS[options.method](
         detector=detector,
         min_score=float(options.min_score),
         state=job.read_weights(f"{detector}_{options.method}"),
@@ -115,15 +114,13 @@ def _create_detector_free(job: StageJob, options: "MatchPairsOptions") -> Detect
     if options.method == "virtual_places":
         from snakesfm.evaluation.colmap_model import read_model
 
-        return create_detector_free(
-            options.method,
+        return DETECTOR_FREE_MATCHERS[options.method](
             model=read_model(Path(job.settings["reference"])),
             spread_px=options.spread_px,
             noise_px=options.noise_px,
             seed=job.seed,
         )
-    return create_detector_free(
-        options.method,
+    return DETECTOR_FREE_MATCHERS[options.method](
         min_score=float(options.min_score),
         longer_side_px=options.longer_side_px,
         state=job.read_weights(options.method),

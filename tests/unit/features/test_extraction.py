@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from snakesfm.features.extraction import create_detector, extract_keypoints, sample_colors
+from snakesfm.features.extraction import DETECTORS, extract_keypoints, sample_colors
 from snakesfm.features.keypoints import KeypointSet
 from snakesfm.features.sift import rootsift
 
@@ -49,26 +49,26 @@ def test_colors_are_of_the_pixel_that_holds_the_keypoint():
 def test_a_budget_counts_places_not_orientations(budget):
     rng = np.random.default_rng(1)
     gray = rng.integers(0, 255, (480, 640)).astype(np.uint8)
-    found = extract_keypoints(
-        create_detector("sift"), [(gray, np.repeat(gray[..., None], 3, 2))], budget, 760
-    )[0]
+    found = extract_keypoints(DETECTORS["sift"](), [(gray, np.repeat(gray[..., None], 3, 2))], budget, 760)[
+        0
+    ]
     assert len(found) == budget == len(np.unique(found.keypoints, axis=0))
 
 
 def test_real_photographs_match_by_their_true_geometry(data):
     from snakesfm.evaluation.colmap_model import read_model
     from snakesfm.ingest.read import read_image
-    from snakesfm.matching.matcher import create_matcher
+    from snakesfm.matching.matcher import MATCHERS
 
     folder = data / "strecha_fountain_p11"
     model = read_model(folder / "reference")
     images = {image.name: image for image in model.images.values()}
     first, second = sorted(images)[:2]
-    detector, points = create_detector("sift"), []
+    detector, points = DETECTORS["sift"](), []
     for name in (first, second):
         pixels = read_image(folder / "images" / name)
         points.append(*extract_keypoints(detector, [(pixels.gray, pixels.rgb)], 2000, 760))
-    matcher = create_matcher("mutual_ratio")
+    matcher = MATCHERS["mutual_ratio"]()
     matches, _ = matcher.match(matcher.prepare(points[0]), matcher.prepare_second(points[1]))
     rays = []
     for name, part, column in ((first, points[0], 0), (second, points[1], 1)):

@@ -9,7 +9,7 @@ from snakesfm.evaluation.colmap_model import read_model
 from snakesfm.features.keypoints import KeypointSource
 from snakesfm.features.virtual import VirtualKeypoints
 from snakesfm.features.virtual_points import ViewPoints
-from snakesfm.matching.matcher import create_matcher
+from snakesfm.matching.matcher import MATCHERS
 
 SIZE = (1024, 768)
 
@@ -45,7 +45,7 @@ def test_an_image_of_another_size_than_its_camera_is_scaled(model):
 
 
 def test_the_matcher_pairs_the_same_points_and_no_others(model):
-    source, matcher = VirtualKeypoints(model), create_matcher("virtual")
+    source, matcher = VirtualKeypoints(model), MATCHERS["virtual"]()
     first, second = (source.read(image.name, SIZE) for image in list(model.images.values())[:2])
     second = second.take(np.random.default_rng(0).permutation(len(second)))
     matches, scores = matcher.match(matcher.prepare(first), matcher.prepare_second(second))

@@ -10,7 +10,7 @@ from snakesfm.artifacts import LocalFeatures
 from snakesfm.config.extract_features import ExtractFeaturesOptions
 from snakesfm.errors import ConfigError
 from snakesfm.features.keypoints import KeypointSet
-from snakesfm.matching.matcher import create_matcher
+from snakesfm.matching.matcher import MATCHERS
 from snakesfm.retrieval.vlad import describe_vlad
 from snakesfm.stages import extract_features
 from snakesfm.stages.job import StageJob
@@ -123,7 +123,7 @@ def test_descriptors_that_are_not_finite_become_zeros_and_harm_neither_matching_
     assert first.dtype == np.float16
     whole = [row for row in range(300) if row not in (5, 7, 11)]
     for one, other in ((first, second), (second, first)):
-        matcher = create_matcher("mutual_ratio", max_ratio=0.8, search="clustered", words=32, probes=3.0)
+        matcher = MATCHERS["mutual_ratio"](max_ratio=0.8, search="clustered", words=32, probes=3.0)
         prepared = [
             KeypointSet(places, rows, places[:, 0], places[:, 0], places[:, 0]) for rows in (one, other)
         ]

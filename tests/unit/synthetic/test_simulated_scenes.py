@@ -10,7 +10,7 @@ from snakesfm.artifacts.features import LocalFeatures
 from snakesfm.artifacts.images import ImageIndex
 from snakesfm.artifacts.pairs import PairMatches, TwoViewGeometries
 from snakesfm.geometry.rotations import angle_of
-from snakesfm.matching.matcher import create_matcher
+from snakesfm.matching.matcher import MATCHERS
 from snakesfm.simulate import Simulation, SimulationOptions, main
 from snakesfm.synthetic.pairing import candidate_pairs, choose_partners, simulate_edge
 from snakesfm.synthetic.sightings import DetectorModel, DistinctLooks, match_looks, sight
@@ -72,7 +72,7 @@ def test_a_sighting_depends_on_its_image_alone(survey: Survey) -> None:
 def test_given_matches_resemble_those_of_the_real_matcher(survey: Survey) -> None:
     i, j = middle_pair(survey)
     a, b = sight(survey, i, 3), sight(survey, j, 3)
-    matcher = create_matcher("mutual_ratio")
+    matcher = MATCHERS["mutual_ratio"]()
     real, _ = matcher.match(matcher.prepare(a.keypoints), matcher.prepare_second(b.keypoints))
     given = match_looks(
         DistinctLooks.of(a.appearance), DistinctLooks.of(b.appearance), 0.65, np.random.default_rng(0)
