@@ -182,7 +182,11 @@ class ScenePlan:
     def files(self, stage: str, parts: str) -> list[str]:
         """All files of a stage that works on 'blocks' or on 'tiles'."""
         names = tile_names(self.blocks) if parts == "tiles" else map(str, range(self.blocks))
-        return [str(self.folder / stage / f"{name}.h5") for name in names]
+        return [self.file(stage, name) for name in names]
+
+    def file(self, stage: str, name: str) -> str:
+        """One artifact of a stage."""
+        return str(self.folder / stage / f"{name}.h5")
 
     @property
     def detector_free(self) -> bool:
@@ -209,24 +213,6 @@ class ScenePlan:
         """The stage whose matches the stages after matching read."""
         return "index_matches" if self.detector_free else "match_pairs"
 
-    def tile_features(self, tile: str) -> list[str]:
-        """The one or two blocks of keypoints that belong to a tile's matches."""
-        blocks = sorted({int(block) for block in tile.split("-")})
-        return [str(self.folder / self.features_stage / f"{block}.h5") for block in blocks]
-
-    def block_tiles(self, block: str) -> list[str]:
-        """The tiles of coordinates with a block's images."""
-        tiles = [name for name in tile_names(self.blocks) if block in name.split("-")]
-        return [str(self.folder / "match_pairs" / f"{name}.h5") for name in tiles]
-
-    def global_descriptors(self) -> list[str]:
-        """The global descriptors of all blocks where pairs are retrieved, else nothing."""
-        return self.files("describe_images", "blocks") if self.select_pairs.needs_descriptors else []
-
-    def previewed_features(self) -> list[str]:
-        """The features of all blocks if pairs are previewed before they are chosen, else nothing."""
-        return self.files("extract_features", "blocks") if self.select_pairs.looks_at_pairs else []
-
     @property
     def describes_pictures(self) -> bool:
         """Whether a network describes the images themselves, instead of their local descriptors."""
@@ -234,7 +220,7 @@ class ScenePlan:
 
     def vocabulary(self) -> list[str]:
         """The codebook of local descriptors where they describe the images, else nothing."""
-        return [] if self.describes_pictures else [str(self.folder / "learn_vocabulary" / "vocabulary.h5")]
+        return [] if self.describes_pictures else [self.file("learn_vocabulary", "vocabulary")]
 
     @functools.cached_property
     def proposed_pair_count(self) -> int:

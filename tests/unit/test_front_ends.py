@@ -26,6 +26,7 @@ from snakesfm.matching.detector_free import DETECTOR_FREE_MATCHERS
 from snakesfm.matching.matcher import MATCHERS
 from snakesfm.plan import Plan
 from snakesfm.retrieval.descriptor import DESCRIPTORS
+from snakesfm.rule_inputs import block_tiles
 from snakesfm.scene_plan import STAGES_IN_DETECTOR_PIXELS, ScenePlan
 
 
@@ -199,7 +200,7 @@ def test_without_keypoints_the_stages_after_matching_read_merged_ones(tmp_path: 
     )
     assert scene.features_stage == "merge_keypoints" and scene.matches_stage == "index_matches"
     assert not any("extract_features" in file for file in scene.all_files())
-    assert [Path(file).stem for file in scene.block_tiles("0")] == ["0-0", "0-1"]
+    assert [Path(file).stem for file in block_tiles(scene, "0")] == ["0-0", "0-1"]
     match = json.loads(scene.params("match_pairs", {"tile": "0-0"}, True))
     assert match["options"]["min_score"] == 0.2 and match["settings"]["device"] == "cpu"
     (sift,) = plan_of(tmp_path).scenes.values()

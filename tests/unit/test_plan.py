@@ -12,6 +12,7 @@ from snakesfm.config.configuration import STAGES, options_class
 from snakesfm.digests import file_digest, settings_text
 from snakesfm.errors import ConfigError
 from snakesfm.plan import Plan
+from snakesfm.rule_inputs import global_descriptors, previewed_features
 from snakesfm.rule_settings import check_named_together
 from snakesfm.seeding import derive_seed
 
@@ -78,16 +79,16 @@ def test_small_scenes_are_exhaustive_and_large_ones_retrieve(tmp_path: Path) -> 
     small = plan_of(tmp_path, images=str(tmp_path / "small")).scenes["small"]
     large = plan_of(tmp_path, images=str(tmp_path / "large")).scenes["large"]
     assert small.select_pairs.method == "exhaustive"
-    assert small.global_descriptors() == []
+    assert global_descriptors(small) == []
     assert not [file for file in small.all_files() if "describe_images" in file]
     assert large.select_pairs.method == "sequential+retrieval"
-    assert len(large.global_descriptors()) == large.blocks == 8
+    assert len(global_descriptors(large)) == large.blocks == 8
     for scene in (small, large):
-        assert scene.previewed_features() == scene.files("extract_features", "blocks")
+        assert previewed_features(scene) == scene.files("extract_features", "blocks")
     assert (large.pair_count, large.proposed_pair_count) == (30 * 1001, 110 * 1001)
     assert small.pair_count == small.proposed_pair_count == 10
     learned = plan_of(tmp_path, images=str(tmp_path / "small"), front_end="aliked+lightglue")
-    assert learned.scenes["small"].previewed_features() == []
+    assert previewed_features(learned.scenes["small"]) == []
 
 
 def test_params_are_canonical_and_follow_content_not_time(tmp_path: Path) -> None:

@@ -8,15 +8,16 @@ import sys
 from snakemake.exceptions import WorkflowError
 from snakemake.settings.types import DeploymentMethod, Quietness
 
-from snakesfm import resources, slurm
+from snakesfm import resources, rule_inputs, slurm
 from snakesfm.errors import SnakesfmError
 from snakesfm.blocks import tile_names
-from snakesfm.config.configuration import check_spelling
+from snakesfm.config.configuration import SCENE_PATTERN, check_spelling
 from snakesfm.job_server import JobServer
 from snakesfm.plan import Plan
 from snakesfm.records import check_folder, makes_nothing
 from snakesfm.rule_settings import check_named_together, share_resources
 from snakesfm.run import Run
+from snakesfm.scene_plan import ScenePlan
 from snakesfm.termination import answer_term_aside
 
 
@@ -57,7 +58,7 @@ MALLOC = {
 
 
 wildcard_constraints:
-    scene="[^/.][^/]*",
+    scene=SCENE_PATTERN,
     block=r"\d+",
     tile=r"\d+-\d+",
 
@@ -81,81 +82,14 @@ def files_of(stage, parts):
     return list_files
 
 
-def keypoint_files(wildcards):
-    """The keypoints of all blocks that the stages after matching read."""
-    scene = PLAN.scenes[wildcards.scene]
-    return scene.files(scene.features_stage, "blocks")
+def of_scene(choose, *parts):
+    """An input function: what 'choose' gives for a scene and, where asked for, a job's block or tile."""
 
+    def list_files(wildcards):
+        scene = PLAN.scenes[wildcards.scene]
+        return choose(scene, *(wildcards[part] for part in parts))
 
-def match_files(wildcards):
-    """The matches of all tiles that the stages after matching read."""
-    scene = PLAN.scenes[wildcards.scene]
-    return scene.files(scene.matches_stage, "tiles")
-
-
-def coordinate_files(wildcards):
-    """What was matched without keypoints in all tiles, else nothing."""
-    scene = PLAN.scenes[wildcards.scene]
-    return scene.files("match_pairs", "tiles") if scene.detector_free else []
-
-
-def tile_features(wildcards):
-    """The one or two blocks of keypoints that belong to a tile's matches."""
-    return PLAN.scenes[wildcards.scene].tile_features(wildcards.tile)
-
-
-def matched_features(wildcards):
-    """The one or two blocks of keypoints that a tile matches, nothing where it matches images."""
-    scene = PLAN.scenes[wildcards.scene]
-    return [] if scene.detector_free else scene.tile_features(wildcards.tile)
-
-
-def matched_images(wildcards):
-    """The index where a tile matches images instead of keypoints, else nothing."""
-    scene = PLAN.scenes[wildcards.scene]
-    return (
-        [str(scene.folder / "index_images" / "index.h5")] if scene.detector_free else []
-    )
-
-
-def tile_matches(wildcards):
-    """The matches of a tile that the stages after matching read."""
-    scene = PLAN.scenes[wildcards.scene]
-    return str(scene.folder / scene.matches_stage / f"{wildcards.tile}.h5")
-
-
-def block_tiles(wildcards):
-    """The tiles with a block's images."""
-    return PLAN.scenes[wildcards.scene].block_tiles(wildcards.block)
-
-
-def global_descriptors(wildcards):
-    """The global descriptors of all blocks where pairs are retrieved, else nothing."""
-    return PLAN.scenes[wildcards.scene].global_descriptors()
-
-
-def previewed_features(wildcards):
-    """The features of all blocks if pairs are previewed before they are chosen, else nothing."""
-    return PLAN.scenes[wildcards.scene].previewed_features()
-
-
-def described_features(wildcards):
-    """A block's local features where these describe its images, else nothing."""
-    scene = PLAN.scenes[wildcards.scene]
-    block = str(scene.folder / "extract_features" / f"{wildcards.block}.h5")
-    return [] if scene.describes_pictures else [block]
-
-
-def described_images(wildcards):
-    """The index where a network describes the images themselves, else nothing."""
-    scene = PLAN.scenes[wildcards.scene]
-    index = str(scene.folder / "index_images" / "index.h5")
-    return [index] if scene.describes_pictures else []
-
-
-def vocabulary_file(wildcards):
-    """The codebook where local features describe the images, else nothing."""
-    return PLAN.scenes[wildcards.scene].vocabulary()
+    return list_files
 
 
 def any_of(names):

@@ -5,8 +5,8 @@ rule export_database:
     input:
         index=artifact("index_images", "index.h5"),
         cameras=artifact("calibrate_cameras", "cameras.h5"),
-        features=keypoint_files,
-        matches=match_files,
+        features=of_scene(rule_inputs.keypoint_files),
+        matches=of_scene(rule_inputs.match_files),
         geometries=files_of("estimate_two_view", "tiles"),
     output:
         artifact("export_database", "database.db"),
@@ -34,8 +34,8 @@ rule hloc:
 rule export_hloc:
     input:
         index=artifact("index_images", "index.h5"),
-        features=keypoint_files,
-        matches=match_files,
+        features=of_scene(rule_inputs.keypoint_files),
+        matches=of_scene(rule_inputs.match_files),
         geometries=files_of("estimate_two_view", "tiles"),
     output:
         artifact("export_hloc", "features.h5"),

@@ -38,9 +38,9 @@ rule learn_vocabulary:
 
 rule describe_images:
     input:
-        features=described_features,
-        vocabulary=vocabulary_file,
-        index=described_images,
+        features=of_scene(rule_inputs.described_features, "block"),
+        vocabulary=of_scene(ScenePlan.vocabulary),
+        index=of_scene(rule_inputs.described_images),
     output:
         artifact("describe_images", "{block}.h5"),
     log:
@@ -67,8 +67,8 @@ for blocks, scenes in PLAN.scenes_by_blocks().items():
             PLAN.select_pairs_rule(blocks)
         input:
             index=artifact("index_images", "index.h5"),
-            descriptors=global_descriptors,
-            features=previewed_features,
+            descriptors=of_scene(rule_inputs.global_descriptors),
+            features=of_scene(rule_inputs.previewed_features),
         output:
             [artifact("select_pairs", f"{tile}.h5") for tile in tile_names(blocks)],
         log:

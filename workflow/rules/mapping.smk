@@ -58,8 +58,8 @@ rule average_rotations:
 rule build_tracks:
     input:
         index=artifact("index_images", "index.h5"),
-        features=keypoint_files,
-        coordinates=coordinate_files,
+        features=of_scene(rule_inputs.keypoint_files),
+        coordinates=of_scene(rule_inputs.coordinate_files),
         geometries=files_of("estimate_two_view", "tiles"),
         graph=artifact("filter_view_graph", "graph.h5"),
         rotations=artifact("average_rotations", "rotations.h5"),
@@ -123,7 +123,7 @@ rule adjust_bundle:
     input:
         index=artifact("index_images", "index.h5"),
         cameras=artifact("calibrate_cameras", "cameras.h5"),
-        features=keypoint_files,
+        features=of_scene(rule_inputs.keypoint_files),
         geometries=files_of("estimate_two_view", "tiles"),
         graph=artifact("filter_view_graph", "graph.h5"),
         rotations=artifact("average_rotations", "rotations.h5"),

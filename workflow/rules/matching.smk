@@ -4,8 +4,8 @@
 rule match_pairs:
     input:
         pairs=artifact("select_pairs", "{tile}.h5"),
-        features=matched_features,
-        index=matched_images,
+        features=of_scene(rule_inputs.matched_features, "tile"),
+        index=of_scene(rule_inputs.matched_images),
     output:
         artifact("match_pairs", "{tile}.h5"),
     log:
@@ -24,7 +24,7 @@ rule match_pairs:
 rule merge_keypoints:
     input:
         index=artifact("index_images", "index.h5"),
-        matches=block_tiles,
+        matches=of_scene(rule_inputs.block_tiles, "block"),
     output:
         artifact("merge_keypoints", "{block}.h5"),
     log:
@@ -42,7 +42,7 @@ rule merge_keypoints:
 rule index_matches:
     input:
         matches=artifact("match_pairs", "{tile}.h5"),
-        features=tile_features,
+        features=of_scene(rule_inputs.tile_features, "tile"),
     output:
         artifact("index_matches", "{tile}.h5"),
     log:
@@ -60,8 +60,8 @@ rule index_matches:
 rule calibrate_cameras:
     input:
         index=artifact("index_images", "index.h5"),
-        features=keypoint_files,
-        matches=match_files,
+        features=of_scene(rule_inputs.keypoint_files),
+        matches=of_scene(rule_inputs.match_files),
     output:
         artifact("calibrate_cameras", "cameras.h5"),
     log:
@@ -82,8 +82,8 @@ rule estimate_two_view:
     input:
         index=artifact("index_images", "index.h5"),
         cameras=artifact("calibrate_cameras", "cameras.h5"),
-        features=tile_features,
-        matches=tile_matches,
+        features=of_scene(rule_inputs.tile_features, "tile"),
+        matches=of_scene(rule_inputs.tile_matches, "tile"),
     output:
         artifact("estimate_two_view", "{tile}.h5"),
     log:

@@ -65,7 +65,8 @@ KINDS = {
     "string_type": "text",
 }
 
-SCENE_PATTERN = r"[^/.{}][^/{}]*"
+# of braces the codes: it is a wildcard's constraint as well, in which Snakemake takes no braces
+SCENE_PATTERN = r"[^/.\x7b\x7d][^/\x7b\x7d]*"
 
 
 def options_class(stage: str) -> type[StageOptions]:
