@@ -40,6 +40,11 @@ class Poses:
         rotations, translations = np.isfinite(self.rotations), np.isfinite(self.translations)
         return np.asarray(rotations.all(axis=(1, 2)) & translations.all(axis=1))
 
+    @property
+    def centers(self) -> Array:
+        """The cameras' positions in the world, (n,3)."""
+        return center_of(self.rotations, self.translations)
+
 
 @dataclass(frozen=True)
 class PoseEvaluation:
@@ -92,53 +97,19 @@ def evaluate_poses(
     """
     known = reference.registered
     names = [name for name, is_known in zip(reference.names, known, strict=True) if is_known]
-    reference_rotations, reference_translations = reference.rotations[known], reference.translations[known]
-    rows = match_names(model.names, names)
-    present = rows >= 0
-    rotations = np.full((len(names), 3, 3), np.nan)
-    translations = np.full((len(names), 3), np.nan)
-    rotations[present], translations[present] = (
-        model.rotations[rows[present]],
-        model.translations[rows[present]],
-    )
-    scored = Poses(names, rotations, translations).registered
-    reference_centers = center_of(reference_rotations, reference_translations)
-    extent = float(np.linalg.norm(np.ptp(reference_centers, axis=0))) if len(names) else 0.0
+    truth = Poses(names, reference.rotations[known], reference.translations[known])
+    found, present = _in_order(model, names)
+    scored = found.registered
+    extent = float(np.linalg.norm(np.ptp(truth.centers, axis=0))) if len(names) else 0.0
+    min_baseline = min_baseline_ratio * extent
+    scale, rotation_deg, position, direction_deg = _aligned_errors(found, truth, min_baseline)
 
     metrics: Metrics = {
         "reference_images": len(names),
-        "reference_images_present": int(present.sum()),
+        "reference_images_present": present,
         "reference_images_registered": int(scored.sum()),
     }
-    relative_rotation, relative_direction = relative_pose_errors(
-        rotations, translations, reference_rotations, reference_translations, min_baseline_ratio * extent
-    )
-    relative = np.maximum(relative_rotation, relative_direction)
-    metrics |= _auc_columns("relative_pose_auc", relative, relative_thresholds_deg)
-    compared = compared_images(len(names))
-    valid = (scored[:, None] & scored[compared]).ravel()
-    metrics["relative_pairs"] = compared.size
-    metrics |= _distribution("relative_rotation_error_deg", relative_rotation[valid])
-    metrics |= _distribution("relative_translation_angle_deg", relative_direction[valid])
-
-    rotation_deg = np.full(len(names), np.nan)
-    direction_deg, position = rotation_deg.copy(), rotation_deg.copy()
-    similarity = None
-    if scored.any():
-        similarity = align_poses(
-            rotations[scored],
-            center_of(rotations[scored], translations[scored]),
-            reference_rotations[scored],
-            reference_centers[scored],
-        )
-        centers = similarity.transform_points(center_of(rotations[scored], translations[scored]))
-        rotation_deg[scored] = chordal_angle_deg(
-            similarity.transform_rotations(rotations[scored]), reference_rotations[scored]
-        )
-        position[scored] = np.linalg.norm(centers - reference_centers[scored], axis=1)
-        direction_deg[scored] = _origin_angles(
-            centers, reference_centers[scored], min_baseline_ratio * extent
-        )
+    metrics |= _relative_metrics(found, truth, min_baseline, relative_thresholds_deg)
     pose_errors = np.where(scored, np.maximum(rotation_deg, direction_deg), FAILED_DEG)
     metrics |= _auc_columns("pose_auc", pose_errors, global_thresholds_deg)
     metrics |= _distribution("rotation_error_deg", rotation_deg[scored])
@@ -147,8 +118,56 @@ def evaluate_poses(
     relative_position = 100.0 * position[scored] / extent if extent > 0 else np.zeros(0)
     metrics |= _distribution("position_error_percent", relative_position)
     metrics["reference_extent"] = extent
-    metrics["alignment_scale"] = None if similarity is None else similarity.scale
+    metrics["alignment_scale"] = scale
     return PoseEvaluation(metrics, names, rotation_deg, position, direction_deg)
+
+
+def _in_order(model: Poses, names: Sequence[str]) -> tuple[Poses, int]:
+    """The model's poses of these images, NaN where it lacks one, and how many it knows."""
+    rows = match_names(model.names, names)
+    present = rows >= 0
+    rotations = np.full((len(names), 3, 3), np.nan)
+    translations = np.full((len(names), 3), np.nan)
+    rotations[present] = model.rotations[rows[present]]
+    translations[present] = model.translations[rows[present]]
+    return Poses(names, rotations, translations), int(present.sum())
+
+
+def _relative_metrics(
+    found: Poses, truth: Poses, min_baseline: float, thresholds_deg: Sequence[float]
+) -> Metrics:
+    """Errors of the poses of pairs; a pair with an image that is not registered counts in the AUC alone."""
+    rotation_deg, direction_deg = relative_pose_errors(
+        found.rotations, found.translations, truth.rotations, truth.translations, min_baseline
+    )
+    compared = compared_images(len(found.names))
+    scored = found.registered
+    valid = (scored[:, None] & scored[compared]).ravel()
+    return {
+        **_auc_columns("relative_pose_auc", np.maximum(rotation_deg, direction_deg), thresholds_deg),
+        "relative_pairs": compared.size,
+        **_distribution("relative_rotation_error_deg", rotation_deg[valid]),
+        **_distribution("relative_translation_angle_deg", direction_deg[valid]),
+    }
+
+
+def _aligned_errors(
+    found: Poses, truth: Poses, min_length: float
+) -> tuple[float | None, Array, Array, Array]:
+    """The scale of the Sim(3) alignment, and each image's errors in rotation, position and direction."""
+    scored = found.registered
+    rotation_deg, position, direction_deg = np.full((3, len(found.names)), np.nan)
+    scale = None
+    if scored.any():
+        rotations, centers = found.rotations[scored], found.centers[scored]
+        true_rotations, true_centers = truth.rotations[scored], truth.centers[scored]
+        similarity = align_poses(rotations, centers, true_rotations, true_centers)
+        scale = similarity.scale
+        moved = similarity.transform_points(centers)
+        rotation_deg[scored] = chordal_angle_deg(similarity.transform_rotations(rotations), true_rotations)
+        position[scored] = np.linalg.norm(moved - true_centers, axis=1)
+        direction_deg[scored] = _origin_angles(moved, true_centers, min_length)
+    return scale, rotation_deg, position, direction_deg
 
 
 def model_metrics(registered: Array, offsets: Array, errors_px: Array) -> Metrics:
