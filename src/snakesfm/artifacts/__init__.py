@@ -1,6 +1,6 @@
 """The files between the stages: one dataclass per kind, with its reader and writer."""
 
-from snakesfm.artifacts.base import Artifact, Header, atomic_path, read_header, write_json
+from snakesfm.artifacts.base import Artifact, Header, atomic_path, read_header, temporary_folder, write_json
 from snakesfm.artifacts.features import GlobalDescriptors, LocalFeatures, Vocabulary
 from snakesfm.artifacts.images import CalibratedCameras, ImageIndex
 from snakesfm.artifacts.mapping import (
@@ -51,5 +51,6 @@ __all__ = [
     "Vocabulary",
     "atomic_path",
     "read_header",
+    "temporary_folder",
     "write_json",
 ]

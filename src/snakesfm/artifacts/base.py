@@ -8,9 +8,11 @@ temporary name in the same folder and renamed, so a file that is there is comple
 import dataclasses
 import json
 import os
+import shutil
 import tempfile
 import zlib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Self
@@ -23,6 +25,7 @@ import snakesfm
 from snakesfm.errors import ArtifactError
 
 Array = NDArray[Any]
+TEMPORARY = ".export."
 STRING = h5py.string_dtype("utf-8")
 
 
@@ -230,6 +233,19 @@ class atomic_path:  # noqa: N801 - used as a function, like contextlib's
             self.temporary.replace(self.path)
         else:
             self.temporary.unlink(missing_ok=True)
+
+
+@contextmanager
+def temporary_folder(folder: Path) -> Iterator[Path]:
+    """Context manager: yields a temporary folder within ``folder``, from which files are to be renamed.
+
+    What writers that were killed left there is removed, so there is one writer at a time.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    for leftover in folder.glob(f"{TEMPORARY}*"):
+        shutil.rmtree(leftover)
+    with tempfile.TemporaryDirectory(prefix=TEMPORARY, dir=folder) as name:
+        yield Path(name)
 
 
 def _remove_leftovers(path: Path) -> None:

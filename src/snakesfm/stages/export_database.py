@@ -1,8 +1,6 @@
 """export_database: features, matches and two-view geometries as a COLMAP database."""
 
 import os
-import shutil
-import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,6 +10,7 @@ from snakesfm.artifacts import (
     LocalFeatures,
     PairMatches,
     TwoViewGeometries,
+    temporary_folder,
 )
 from snakesfm.artifacts.pairs import KINDS
 from snakesfm.geometry.camera import Camera, cameras_from_columns
@@ -22,7 +21,6 @@ if TYPE_CHECKING:
 
     from snakesfm.config.export_database import ExportDatabaseOptions
 
-TEMPORARY = ".export."
 SIFT_SIZE = 128
 
 
@@ -34,12 +32,8 @@ def run(job: StageJob) -> None:
     options: ExportDatabaseOptions = job.options
     index = ImageIndex.read(job.path("index"))
     cameras = cameras_from_columns(*CalibratedCameras.read(job.path("cameras")).camera_columns)
-    folder = job.output.parent
-    folder.mkdir(parents=True, exist_ok=True)
-    for leftover in folder.glob(f"{TEMPORARY}*"):
-        shutil.rmtree(leftover)
-    with tempfile.TemporaryDirectory(prefix=TEMPORARY, dir=folder) as name:
-        path = Path(name) / job.output.name
+    with temporary_folder(job.output.parent) as temporary:
+        path = temporary / job.output.name
         database = pycolmap.Database.open(path)
         try:
             with pycolmap.DatabaseTransaction(database):

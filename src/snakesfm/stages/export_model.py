@@ -3,14 +3,13 @@
 import json
 import shutil
 import sys
-import tempfile
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from snakesfm.artifacts import CalibratedCameras, ImageIndex, Reconstruction
+from snakesfm.artifacts import CalibratedCameras, ImageIndex, Reconstruction, temporary_folder
 from snakesfm.export.colmap import (
     build_reconstruction,
     other_model_sizes,
@@ -35,7 +34,6 @@ if TYPE_CHECKING:
 
 SUMMARY = "summary.json"
 UNDISTORTED = "undistorted"
-TEMPORARY = ".export."
 SPACES = (
     "Some image names contain spaces, where COLMAP cuts them when it reads images.txt: use the .bin files."
 )
@@ -110,26 +108,53 @@ def run(job: StageJob) -> None:
     cameras = cameras_from_columns(model.camera_models, model.camera_sizes, model.camera_params)
     names = [str(name) for name in index.names]
     registered = registered_images(model.rotations, model.translations)
-    used = sorted({int(index.camera_ids[row]) for row in registered})
-    warnings = [line for row in used for line in camera_warnings(cameras[row], row + 1)]
-    warnings += [
-        RESET_CAMERA.format(camera=row + 1, model=cameras[row].model, cause=adjusted.camera_resets[row])
-        for row in used
-        if adjusted.camera_resets[row]
-    ]
-    warnings += [
-        FAR_PRINCIPAL_POINT.format(
-            camera=row + 1, model=cameras[row].model, offset=adjusted.camera_offsets[row]
+    warnings = _warnings(job, index, adjusted, model, place, cameras)
+    given_masks = Path(job.settings["masks"]) if "masks" in job.settings else None
+    of_image = {names[row]: cameras[index.camera_ids[row]] for row in registered}
+    masks = _masks(given_masks, of_image, warnings)
+    for line in warnings:
+        sys.stderr.write(f"warning: {line}\n")
+    folder = _export_folder(job)
+    with temporary_folder(folder) as temporary:
+        for number in range(max(1, adjusted.model_count)):
+            selected = _placed(job, index, adjusted.select_model(number))[0] if number else model
+            _write_colmap(temporary, number, _build(names, index, cameras, selected))
+        content = transforms(
+            names, index.camera_ids, cameras, model.rotations, model.translations, registered, masks
         )
-        for row in used
-        if np.isfinite(adjusted.camera_offsets[row])
-    ]
+        _write_json(temporary / "transforms.json", content)
+        summary = summarize(job.scene, names, adjusted.models, model.offsets, model.errors_px, warnings)
+        _write_json(temporary / SUMMARY, {**summary, "georeference": place and place.summary()})
+        _place_pictures(job, folder, names, index.orientations, masks)
+        if job.options.undistort:
+            write_undistorted(
+                temporary / UNDISTORTED,
+                temporary / "sparse" / "0",
+                folder / "images",
+                given_masks,
+                job.threads,
+            )
+        _publish(temporary, folder)
+
+
+def _warnings(
+    job: StageJob,
+    index: ImageIndex,
+    adjusted: Reconstruction,
+    model: Reconstruction,
+    place: Georeference | None,
+    cameras: list[Camera],
+) -> list[str]:
+    """What a user should know of the model, a sentence each."""
+    registered = registered_images(model.rotations, model.translations)
+    used = {row: cameras[row] for row in sorted({int(index.camera_ids[row]) for row in registered})}
+    warnings = _camera_warnings(adjusted, used)
     warnings += _lens_warnings(model, cameras, index.camera_ids)
     if job.options.undistort:
-        warnings += _cut_warnings({row: cameras[row] for row in used})
-    if len({cameras[row].is_fisheye for row in used}) > 1:
+        warnings += _cut_warnings(used)
+    if len({camera.is_fisheye for camera in used.values()}) > 1:
         warnings.append(MIXED_LENSES)
-    if any(" " in names[row] for row in registered):
+    if any(" " in str(index.names[row]) for row in registered):
         warnings.append(SPACES)
     others = other_model_sizes(adjusted.models)
     if others:
@@ -138,59 +163,24 @@ def run(job: StageJob) -> None:
         warnings.append(REFUSED.format(count=len(index.refused_names), first=index.refused_reasons[0]))
     warnings += [str(line) for line in index.warnings]
     warnings += [str(line) for line in CalibratedCameras.read(job.path("cameras")).warnings]
-    if job.options.georeference is True and place is None:
-        known = np.isfinite(index.gps[registered])
-        told, flat = int(known.all(axis=1).sum()), int(known[:, :2].all(axis=1).sum())
-        lacking = told < min(LEAST_IMAGES, flat)
-        warnings.append(NO_ALTITUDE.format(count=flat - told) if lacking else NO_PLACE)
-    if place is not None and not place.trusted:
-        warnings.append(UNTRUSTED_PLACE.format(inliers=place.inliers, images=place.images))
+    warnings += _place_warnings(place, job.options.georeference is True, index.gps[registered])
     copies = int(np.count_nonzero(index.duplicate_of >= 0))
-    if copies:
-        warnings.append(COPIES.format(count=copies))
-    given_masks = Path(job.settings["masks"]) if "masks" in job.settings else None
-    of_image = {names[row]: cameras[index.camera_ids[row]] for row in registered}
-    masks = _masks(given_masks, of_image, warnings)
-    for line in warnings:
-        sys.stderr.write(f"warning: {line}\n")
-    folder = _export_folder(job)
-    folder.mkdir(parents=True, exist_ok=True)
-    for leftover in folder.glob(f"{TEMPORARY}*"):
-        shutil.rmtree(leftover)
-    with tempfile.TemporaryDirectory(prefix=TEMPORARY, dir=folder) as name:
-        temporary = Path(name)
-        sparse = temporary / "sparse"
-        for number in range(max(1, adjusted.model_count)):
-            folder_of = sparse / str(number)
-            folder_of.mkdir(parents=True)
-            selected = _placed(job, index, adjusted.select_model(number))[0] if number else model
-            colmap = _build(names, index, cameras, selected)
-            colmap.write_binary(str(folder_of))
-            colmap.write_text(str(folder_of))
-            if number == 0:
-                colmap.export_PLY(str(temporary / "points.ply"))
-        content = transforms(
-            names, index.camera_ids, cameras, model.rotations, model.translations, registered, masks
-        )
-        _write_json(temporary / "transforms.json", content)
-        summary = summarize(job.scene, names, adjusted.models, model.offsets, model.errors_px, warnings)
-        _write_json(temporary / SUMMARY, {**summary, "georeference": place and place.summary()})
-        options: ExportModelOptions = job.options
-        if options.link_images or options.undistort:
-            place_images(folder / "images", Path(job.settings["images"]), names, index.orientations)
-        if options.link_images and given_masks is not None and masks:
-            upright = np.ones(len(masks), np.int32)
-            place_images(folder / "masks", given_masks, list(masks.values()), upright)
-        elif (folder / "masks").is_symlink():
-            (folder / "masks").unlink()
-        if options.undistort:
-            write_undistorted(
-                temporary / UNDISTORTED, sparse / "0", folder / "images", given_masks, job.threads
-            )
-        shutil.rmtree(folder / UNDISTORTED, ignore_errors=True)
-        for former in (folder / "sparse").glob("[1-9]*"):
-            shutil.rmtree(former)
-        _publish(temporary, folder)
+    return warnings + ([COPIES.format(count=copies)] if copies else [])
+
+
+def _camera_warnings(adjusted: Reconstruction, cameras: dict[int, Camera]) -> list[str]:
+    """What other tools cannot do with cameras, given by rows, and what bundle adjustment could not."""
+    warnings = [line for row, camera in cameras.items() for line in camera_warnings(camera, row + 1)]
+    warnings += [
+        RESET_CAMERA.format(camera=row + 1, model=camera.model, cause=adjusted.camera_resets[row])
+        for row, camera in cameras.items()
+        if adjusted.camera_resets[row]
+    ]
+    return warnings + [
+        FAR_PRINCIPAL_POINT.format(camera=row + 1, model=camera.model, offset=adjusted.camera_offsets[row])
+        for row, camera in cameras.items()
+        if np.isfinite(adjusted.camera_offsets[row])
+    ]
 
 
 def _lens_warnings(model: Reconstruction, cameras: list[Camera], camera_ids: np.ndarray) -> list[str]:
@@ -217,6 +207,17 @@ def _cut_warnings(cameras: dict[int, Camera]) -> list[str]:
         for row, share in shares.items()
         if share < LEAST_UNDISTORTED
     ]
+
+
+def _place_warnings(place: Georeference | None, is_wanted: bool, gps: np.ndarray) -> list[str]:
+    """Why there is no place though one is wanted, or none to rely on; ``gps`` is of registered images."""
+    if place is not None:
+        return [] if place.trusted else [UNTRUSTED_PLACE.format(inliers=place.inliers, images=place.images)]
+    if not is_wanted:
+        return []
+    known = np.isfinite(gps)
+    told, flat = int(known.all(axis=1).sum()), int(known[:, :2].all(axis=1).sum())
+    return [NO_ALTITUDE.format(count=flat - told) if told < min(LEAST_IMAGES, flat) else NO_PLACE]
 
 
 def _masks(folder: Path | None, cameras: dict[str, Camera], warnings: list[str]) -> dict[str, str]:
@@ -269,6 +270,30 @@ def _build(
     )
 
 
+def _write_colmap(folder: Path, number: int, model: "pycolmap.Reconstruction") -> None:
+    """One model, binary and as text; the points of the first as PLY too."""
+    sparse = folder / "sparse" / str(number)
+    sparse.mkdir(parents=True)
+    model.write_binary(str(sparse))
+    model.write_text(str(sparse))
+    if number == 0:
+        model.export_PLY(str(folder / "points.ply"))
+
+
+def _place_pictures(
+    job: StageJob, folder: Path, names: list[str], orientations: np.ndarray, masks: dict[str, str]
+) -> None:
+    """Put the images, and the masks if there are any, beside the model where that is wanted."""
+    options: ExportModelOptions = job.options
+    if options.link_images or options.undistort:
+        place_images(folder / "images", Path(job.settings["images"]), names, orientations)
+    if options.link_images and masks:
+        upright = np.ones(len(masks), np.int32)
+        place_images(folder / "masks", Path(job.settings["masks"]), list(masks.values()), upright)
+    elif (folder / "masks").is_symlink():
+        (folder / "masks").unlink()
+
+
 def _export_folder(job: StageJob) -> Path:
     """The folder that holds summary.json, whichever place it has among the outputs."""
     return next((path.parent for path in job.outputs if path.name == SUMMARY), job.output.parent)
@@ -279,7 +304,10 @@ def _write_json(path: Path, content: object) -> None:
 
 
 def _publish(temporary: Path, folder: Path) -> None:
-    """Rename every finished file into place; the summary, which says that all is there, last."""
+    """Replace the former export by every finished file; the summary, which says that all is there, last."""
+    shutil.rmtree(folder / UNDISTORTED, ignore_errors=True)
+    for former in (folder / "sparse").glob("[1-9]*"):
+        shutil.rmtree(former)
     files = sorted(path.relative_to(temporary) for path in temporary.rglob("*") if path.is_file())
     for file in sorted(files, key=lambda file: file.name == SUMMARY):
         (folder / file).parent.mkdir(parents=True, exist_ok=True)
