@@ -10,6 +10,16 @@ from numpy.typing import NDArray
 from snakesfm.reporting.registration import ImageCounts
 
 Array = NDArray[Any]
+IMAGE_HEADS = ["image", "registered", "pairs", "accepted", "kept edges", "observations", "mean error px"]
+ROUND_HEADS = [
+    "round",
+    "images",
+    "points",
+    "observations",
+    "cost before",
+    "cost after",
+    "mean error, detector px",
+]
 STATISTICS = ("median", "mean", "p90", "max")
 AREAS = re.compile(r"(?P<row>.*_auc)_(?P<column>[\d.]+)deg")
 ERRORS = re.compile(rf"(?P<row>.*)_(?P<column>{'|'.join(STATISTICS)})")
@@ -25,7 +35,7 @@ def label_counts(labels: Array, names: Sequence[str]) -> list[tuple[str, int]]:
 
 
 def bundle_rows(names: Array, counts: Array, costs: Array, errors_px: Array) -> list[list[Any]]:
-    """One row per round of the adjustment: name, images, points, observations, costs, mean error."""
+    """One row per round of the adjustment, of what ``ROUND_HEADS`` names."""
     return [
         [str(names[k]), *counts[k].tolist(), *costs[k].tolist(), float(errors_px[k])]
         for k in range(len(names))
@@ -74,13 +84,13 @@ def _words(name: str) -> str:
     return name.replace("_", " ").replace("auc", "AUC")
 
 
-def image_rows(
+def image_table(
     names: Sequence[str],
     counts: ImageCounts,
     per_image: Mapping[str, Mapping[str, float | None]],
     most: int,
-) -> tuple[list[list[Any]], str]:
-    """Rows of the table of images, and a note where it does not show all.
+) -> tuple[list[str], list[list[Any]], str]:
+    """Heads and rows of the table of images, and a note where it does not show all.
 
     Parameters
     ----------
@@ -108,4 +118,5 @@ def image_rows(
             scores = per_image.get(names[image], {})
             row += [scores.get("rotation_error_deg"), scores.get("position_error")]
         rows.append(row)
-    return rows, note
+    scored = ["rotation error deg", "position error"] if per_image else []
+    return [*IMAGE_HEADS, *scored], rows, note

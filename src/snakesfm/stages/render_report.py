@@ -33,7 +33,7 @@ from snakesfm.reporting.registration import (
     mean_by_image,
     reason_not_registered,
 )
-from snakesfm.reporting.tables import bundle_rows, image_rows, label_counts, metric_tables
+from snakesfm.reporting.tables import ROUND_HEADS, bundle_rows, image_table, label_counts, metric_tables
 from snakesfm.stages.job import StageJob
 from snakesfm.tracks.merged import describe_lengths
 
@@ -66,7 +66,6 @@ def run(job: StageJob) -> None:
     # no declared inputs: a lost log is no reason to run the job again
     logs = _logs_in_use(job.output.parents[1] / "logs", job.paths("geometries"))
 
-    count = len(index.names)
     names = [str(name) for name in index.names]
     point_of = np.repeat(np.arange(len(model.points)), np.diff(model.offsets))
     cameras = cameras_from_columns(model.camera_models, model.camera_sizes, model.camera_params)
@@ -79,23 +78,9 @@ def run(job: StageJob) -> None:
         model.image_ids,
         model.keypoints,
     )
-    counts = ImageCounts(
-        pairs=count_by_image(pairs.pairs, count),
-        accepted=count_by_image(pairs.pairs[pairs.rejections == 0], count),
-        kept=count_by_image(graph.pairs[graph.labels == 0], count),
-        components=graph.components,
-        rotated=np.asarray(np.isfinite(rotations.rotations).all(axis=(1, 2))),
-        track_observations=count_by_image(tracks["image_ids"], count),
-        point_observations=count_by_image(points["image_ids"], count),
-        models=adjusted.models,
-        observations=count_by_image(model.image_ids, count),
-        mean_error_px=mean_by_image(errors, model.image_ids, count),
-    )
+    counts = _counts(adjusted.models, model, errors, pairs, graph, rotations, tracks, points)
     seconds = stage_costs(path.read_text("utf-8", errors="replace") for path in logs)
-    rows, note = image_rows(names, counts, metrics.get("per_image", {}), job.options.max_images)
-    heads = ["image", "registered", "pairs", "accepted", "kept edges", "observations", "mean error px"]
-    if metrics.get("per_image"):
-        heads += ["rotation error deg", "position error"]
+    heads, rows, note = image_table(names, counts, metrics.get("per_image", {}), job.options.max_images)
     registered = np.flatnonzero(counts.registered)
     page = Page(
         scene=job.scene,
@@ -105,26 +90,7 @@ def run(job: StageJob) -> None:
         maps=_maps(names, model, registered),
         stage_heads=["stage", "result", *(["seconds", "peak MB"] if seconds else [])],
         stages=_stage_rows(index, pairs, graph, rotations, tracks, points, model, counts, seconds),
-        tables=[
-            ("Pairs", ["outcome", "pairs"], label_counts(pairs.rejections, ("accepted", *REJECTIONS[1:]))),
-            ("View graph", ["filter", "edges"], label_counts(graph.labels, EDGE_LABELS)),
-            (
-                "Bundle adjustment",
-                [
-                    "round",
-                    "images",
-                    "points",
-                    "observations",
-                    "cost before",
-                    "cost after",
-                    "mean error, detector px",
-                ],
-                bundle_rows(
-                    model.round_names, model.round_counts, model.round_costs, model.round_errors_px
-                ),
-            ),
-            *metric_tables(metrics),
-        ],
+        tables=_tables(pairs, graph, model, metrics),
         histogram=error_histogram(errors),
         histogram_caption=f"Errors of {len(errors):,} observations; the last bar includes the largest 1 %.",
         missing=_missing(index, names, counts, pairs, graph),
@@ -136,6 +102,46 @@ def run(job: StageJob) -> None:
     )
     with atomic_path(job.output) as temporary:
         temporary.write_text(render_page(page), "utf-8")
+
+
+def _counts(
+    models: Array,
+    model: Reconstruction,
+    errors: Array,
+    pairs: Pairs,
+    graph: ViewGraph,
+    rotations: CameraRotations,
+    tracks: Mapping[str, Array],
+    points: Mapping[str, Array],
+) -> ImageCounts:
+    """What each stage kept of every image; ``models`` is the model (N,) that each is in."""
+    count = len(models)
+    return ImageCounts(
+        pairs=count_by_image(pairs.pairs, count),
+        accepted=count_by_image(pairs.pairs[pairs.rejections == 0], count),
+        kept=count_by_image(graph.pairs[graph.labels == 0], count),
+        components=graph.components,
+        rotated=np.asarray(np.isfinite(rotations.rotations).all(axis=(1, 2))),
+        track_observations=count_by_image(tracks["image_ids"], count),
+        point_observations=count_by_image(points["image_ids"], count),
+        models=models,
+        observations=count_by_image(model.image_ids, count),
+        mean_error_px=mean_by_image(errors, model.image_ids, count),
+    )
+
+
+def _tables(
+    pairs: Pairs, graph: ViewGraph, model: Reconstruction, metrics: Mapping[str, Any]
+) -> list[tuple[str, list[str], Sequence[Sequence[Any]]]]:
+    """Title, heads and rows of the tables between those of stages and of images."""
+    outcomes = label_counts(pairs.rejections, ("accepted", *REJECTIONS[1:]))
+    rounds = bundle_rows(model.round_names, model.round_counts, model.round_costs, model.round_errors_px)
+    return [
+        ("Pairs", ["outcome", "pairs"], outcomes),
+        ("View graph", ["filter", "edges"], label_counts(graph.labels, EDGE_LABELS)),
+        ("Bundle adjustment", ROUND_HEADS, rounds),
+        *metric_tables(metrics),
+    ]
 
 
 def _logs_in_use(folder: Path, tile_files: Sequence[Path]) -> list[Path]:

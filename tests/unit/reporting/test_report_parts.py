@@ -16,7 +16,7 @@ from snakesfm.reporting.registration import (
     mean_by_image,
     reason_not_registered,
 )
-from snakesfm.reporting.tables import image_rows, label_counts, metric_tables
+from snakesfm.reporting.tables import image_table, label_counts, metric_tables
 from snakesfm.synthetic.layouts import look_at
 from snakesfm.synthetic.problems import make_problem
 
@@ -107,12 +107,15 @@ def test_labels_beyond_the_known_ones_are_still_counted() -> None:
 
 def test_image_rows_show_errors_against_the_reference_and_the_fewest_observations() -> None:
     names = ["a", "b", "c"]
-    rows, note = image_rows(names, counts(), {"c": {"rotation_error_deg": 0.1, "position_error": None}}, 2)
+    scores = {"c": {"rotation_error_deg": 0.1, "position_error": None}}
+    heads, rows, note = image_table(names, counts(), scores, 2)
+    assert [len(row) for row in rows] == [len(heads)] * 2
     assert [row[0] for row in rows] == ["a", "c"]
     assert rows[0][-3:] == [None, None, None]
     assert rows[1][-2:] == [0.1, None]
     assert "of 3" in note
-    assert image_rows(names, counts(), {}, 3)[1] == ""
+    heads, rows, note = image_table(names, counts(), {}, 3)
+    assert [len(row) for row in rows] == [len(heads)] * 3 and note == ""
 
 
 def test_metrics_are_grouped_by_threshold_and_statistic_without_texts() -> None:
