@@ -7,6 +7,7 @@ from pathlib import Path
 
 from snakesfm.digests import file_digest, file_state
 from snakesfm.errors import ConfigError
+from snakesfm.hloc_files import MATCHES, PAIRS
 
 # the ending by which a file of matches is told from a text file
 MATCHES_SUFFIX = ".h5"
@@ -14,7 +15,7 @@ MATCHES_SUFFIX = ".h5"
 
 def find_pair_list(folder: Path) -> str:
     """The list of pairs in a folder of hloc's files, or else its matches, which name pairs; "" for none."""
-    files = (folder / "pairs.txt", folder / f"matches{MATCHES_SUFFIX}")
+    files = (folder / PAIRS, folder / MATCHES)
     return next((str(path) for path in files if path.is_file()), "")
 
 

@@ -12,6 +12,7 @@ from snakesfm.given_files import (
     find_model_folder,
     looks_like_cameras,
 )
+from snakesfm.hloc_files import FEATURES, MATCHES
 from snakesfm.ingest.discover import count_images, list_photographs, walk_images
 from snakesfm.ingest.masks import find_mask
 from snakesfm.scene_plan import ScenePlan
@@ -129,7 +130,7 @@ def _check_given_files(scene: ScenePlan) -> None:
     if scene.inputs.imported and not Path(scene.inputs.imported).expanduser().is_dir():
         raise ConfigError(
             f"'{scene.inputs.imported}', given as imported= for scene '{scene.name}', is not a folder: "
-            "give the folder that contains hloc's features.h5 and matches.h5."
+            f"give the folder that contains hloc's {FEATURES} and {MATCHES}."
         )
     reference = scene.inputs.reference
     if reference and find_model_folder(Path(reference).expanduser()) is None:

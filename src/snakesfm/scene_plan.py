@@ -24,6 +24,7 @@ from snakesfm.front_ends import (
     needed_weights,
 )
 from snakesfm.geometry.detector_sides import LONGER_SIDE, SHORTER_SIDE
+from snakesfm.hloc_files import FEATURES, MATCHES, PAIRS
 from snakesfm.ingest.discover import count_images, fingerprint_images
 from snakesfm.pair_lists import estimate_pair_count, find_pair_list, pair_list_state
 from snakesfm.resources import Load, job_load
@@ -153,7 +154,7 @@ class ScenePlan:
             return {"reference": reference, "source_content": file_digest(reference)}
         if method == "imported":
             folder = Path(self.inputs.imported).expanduser()
-            name = "features.h5" if stage == "extract_features" else "matches.h5"
+            name = FEATURES if stage == "extract_features" else MATCHES
             return {"imported": str(folder), "source_content": file_state(folder / name)}
         return {}
 
@@ -255,8 +256,7 @@ class ScenePlan:
 
     def hloc_files(self) -> list[str]:
         """Features and matches in hloc's files, which only their own target makes."""
-        names = ("features.h5", "matches.h5", "pairs.txt")
-        return [str(self.folder / "export_hloc" / name) for name in names]
+        return [str(self.folder / "export_hloc" / name) for name in (FEATURES, MATCHES, PAIRS)]
 
     def results(self, asked: Set[str]) -> list[str]:
         """What a run makes for others that does not say of itself how it was made.

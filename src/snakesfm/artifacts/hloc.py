@@ -16,10 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from snakesfm.errors import ConfigError
+from snakesfm.hloc_files import FEATURES, MATCHES, PAIRS
 
 Array = NDArray[Any]
 
-FEATURES, MATCHES, PAIRS = "features.h5", "matches.h5", "pairs.txt"
 CENTER_SHIFT = np.float32(0.5)
 # old versions joined the names of a pair by another sign
 JOINTS = ("/", "_")

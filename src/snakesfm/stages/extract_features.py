@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from snakesfm.artifacts.features import LocalFeatures
 from snakesfm.artifacts.hloc import (
-    FEATURES,
     descriptor_size,
     open_hloc,
     read_hloc_features,
@@ -23,6 +22,7 @@ from snakesfm.digests import file_digest
 from snakesfm.errors import ConfigError, ImageError
 from snakesfm.features.extraction import DETECTORS, extract_keypoints, sample_colors
 from snakesfm.features.keypoints import Detector, KeypointSet, KeypointSource
+from snakesfm.hloc_files import FEATURES
 from snakesfm.ingest.masks import find_mask, read_mask
 from snakesfm.ingest.read import read_image
 from snakesfm.learned.batches import in_batches

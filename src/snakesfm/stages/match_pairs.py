@@ -13,13 +13,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from snakesfm.artifacts.features import LocalFeatures
-from snakesfm.artifacts.hloc import MATCHES, open_hloc, read_hloc_matches
+from snakesfm.artifacts.hloc import open_hloc, read_hloc_matches
 from snakesfm.artifacts.images import ImageIndex
 from snakesfm.artifacts.pairs import ImagePairs, PairCoordinates, PairMatches
 from snakesfm.errors import ImageError
 from snakesfm.features.keypoints import KeypointSet
 from snakesfm.front_ends import DETECTOR_FREE
 from snakesfm.geometry.detector_sides import LEAST_SIDE_PX
+from snakesfm.hloc_files import MATCHES
 from snakesfm.learned.batches import cut
 from snakesfm.matching.detector_free import (
     DETECTOR_FREE_MATCHERS,
