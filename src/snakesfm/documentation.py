@@ -37,7 +37,8 @@ def describe_options() -> None:
     """
     models: tuple[type[BaseModel], ...] = (SceneInputs, RunOptions, *map(options_class, STAGES))
     for cls in models:
-        for name, sentence in _sentences_below(cls).items():
+        inherited = _sentences_below(SceneInputs) if issubclass(cls, SceneInputs) else {}
+        for name, sentence in (inherited | _sentences_below(cls)).items():
             cls.model_fields[name].description = sentence
         cls.model_rebuild(force=True)
     whole = configuration_class()

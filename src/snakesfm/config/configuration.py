@@ -112,8 +112,8 @@ FrontEndName = Literal[
 ]
 
 
-class RunOptions(Options):
-    """Options of the whole run."""
+class RunOptions(SceneInputs):
+    """Options of the whole run, and the inputs of its scene where there is one."""
 
     images: str = "demo/images"
     """Folder of photographs, searched with all its subfolders; unused if `scenes` lists any."""
@@ -122,19 +122,6 @@ class RunOptions(Options):
     scene: str = ""
     """Name of the scene; empty uses the name of the image folder (or of its parent, if it is called
     'images')."""
-    reference: str = ""
-    """Folder of a COLMAP model to evaluate against; empty for none."""
-    cameras: str = ""
-    """Known intrinsics: a COLMAP cameras.txt (or its folder) or a 3x3 K.txt; empty for none."""
-    intrinsics: Literal["fixed", "refine"] = "fixed"
-    """Whether bundle adjustment keeps known intrinsics fixed or refines them."""
-    masks: str = ""
-    """Folder of masks, black where no keypoints are wanted: 'a/b.jpg.png' for 'a/b.jpg'; empty for none."""
-    pairs: str = ""
-    """Text file of image pairs, one 'name0 name1' per line, for select_pairs.method 'listed'; empty for
-    none."""
-    imported: str = ""
-    """Folder with hloc's features.h5, matches.h5 and pairs.txt, for the front-end 'imported'."""
     front_end: FrontEndName = ""
     """Detector and matcher by one name; empty uses the methods set in extract_features and match_pairs."""
     weights: str = "weights"
