@@ -26,7 +26,18 @@ from snakesfm.matching.detector_free import DETECTOR_FREE_MATCHERS
 from snakesfm.matching.matcher import MATCHERS
 from snakesfm.plan import Plan
 from snakesfm.retrieval.descriptor import DESCRIPTORS
-from snakesfm.rule_inputs import block_tiles
+from snakesfm.rule_inputs import (
+    block_tiles,
+    coordinate_files,
+    described_features,
+    described_images,
+    keypoint_files,
+    match_files,
+    matched_features,
+    matched_images,
+    tile_features,
+    tile_matches,
+)
 from snakesfm.scene_plan import STAGES_IN_DETECTOR_PIXELS, ScenePlan
 
 
@@ -201,11 +212,17 @@ def test_without_keypoints_the_stages_after_matching_read_merged_ones(tmp_path: 
     assert scene.features_stage == "merge_keypoints" and scene.matches_stage == "index_matches"
     assert not any("extract_features" in file for file in scene.all_files())
     assert [Path(file).stem for file in block_tiles(scene, "0")] == ["0-0", "0-1"]
+    assert matched_features(scene, "0-1") == [] != tile_features(scene, "0-1")
+    assert [Path(file).name for file in matched_images(scene)] == ["index.h5"]
+    assert coordinate_files(scene) == scene.files("match_pairs", "tiles") != match_files(scene)
     match = json.loads(scene.params("match_pairs", {"tile": "0-0"}, True))
     assert match["options"]["min_score"] == 0.2 and match["settings"]["device"] == "cpu"
     (sift,) = plan_of(tmp_path).scenes.values()
     assert sift.features_stage == "extract_features" and sift.matches_stage == "match_pairs"
     assert not any("merge_keypoints" in file for file in sift.all_files())
+    assert matched_features(sift, "0-1") == tile_features(sift, "0-1") == keypoint_files(sift)
+    assert matched_images(sift) == coordinate_files(sift) == []
+    assert tile_matches(sift, "0-1") in match_files(sift) == sift.files("match_pairs", "tiles")
 
 
 @pytest.mark.parametrize(
@@ -282,6 +299,9 @@ def test_networks_that_describe_images_need_no_keypoints_and_no_vocabulary(tmp_p
         (scene,) = plan.scenes.values()
         assert plan.models == models
         assert scene.describes_pictures == (method == "megaloc") == (not scene.vocabulary())
+        assert (
+            len(described_images(scene)) == (method == "megaloc") == 1 - len(described_features(scene, "0"))
+        )
         assert scene.gpus("describe_images") == (method == "megaloc")
         assert scene.detects_keypoints == (method == "vlad")
     command = json.loads(scene.params("describe_images", {"block": "0"}, True))["settings"]["fetch"]

@@ -124,6 +124,7 @@ def job_files():
     """
 
     def render(wildcards, input, output):
+        scene = PLAN.scenes[wildcards.scene]
         call = {
             "scene": wildcards.scene,
             "inputs": {
@@ -131,8 +132,8 @@ def job_files():
                 for name, value in input.items()
             },
             "outputs": list(output)[:MOST_LISTED_OUTPUTS],
-            "upstream": PLAN.scenes[wildcards.scene].upstream(input),
-            "batch_size": PLAN.scenes[wildcards.scene].configuration.batch_size,
+            "upstream": scene.upstream(input),
+            "batch_size": scene.configuration.batch_size,
         }
         return json.dumps(call)
 
