@@ -31,6 +31,10 @@ class AverageTranslationsOptions(StageOptions):
     edge_weight: float = Field(default=0.1, ge=0, le=1e6)
     """Weight of a two-view direction relative to that of a ray in the refinement."""
 
+    restarts: int = Field(default=4, ge=0, le=100)
+    """Random starts of global positioning with more rays, tried only if few rays agree with the positions
+    (repeated facades); the positions with which most rays agree are kept (0: none)."""
+
     reject_outliers: Literal["mfas", "residual", "none"] = "residual"
     """How translation_recovery rejects edges: MFAS of 1DSfM, by the residuals of a first solution, or
     not at all."""

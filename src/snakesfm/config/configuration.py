@@ -131,7 +131,7 @@ class RunOptions(SceneInputs):
     batch_size: Annotated[int, Field(ge=1, le=256)] | Literal["auto"] = "auto"
     """Number of images or pairs passed to a network at once; 'auto' is 1 on the CPU, 4 on CUDA."""
     scenes: dict[str, SceneInputs] = Field(default_factory=dict)
-    """Several scenes: a mapping from name to images, reference, cameras, intrinsics, masks, pairs and imported."""
+    """Several scenes: a mapping from name to images, cameras, masks and the other inputs of a scene."""
     seed: int = Field(default=0, ge=0)
     """Seed of every random draw; the same seed gives the same model."""
     blocks: Annotated[int, Field(ge=1)] | Literal["auto"] = "auto"

@@ -11,7 +11,7 @@ from snakesfm.artifacts.pairs import KINDS, ViewGraph
 from snakesfm.errors import SceneError
 from snakesfm.geometry.camera import cameras_from_columns, undistort
 from snakesfm.stages.job import StageJob
-from snakesfm.translation_averaging.average import average_components
+from snakesfm.translation_averaging.average import DOUBTFUL_SHARE, average_components
 from snakesfm.translation_averaging.averagers import (
     GlobalPositioning,
     ScaleChain,
@@ -28,6 +28,11 @@ from snakesfm.translation_averaging.support import SupportLimits
 
 if TYPE_CHECKING:
     from snakesfm.config.average_translations import AverageTranslationsOptions
+
+DOUBTFUL = (
+    "only {percent:.0f} % of the rays agree with the camera positions: the model may be folded, as happens "
+    "where parts of the scene look alike; check it, or add images in between."
+)
 
 
 def run(job: StageJob) -> None:
@@ -85,14 +90,19 @@ def run(job: StageJob) -> None:
         refine=options.refine,
         rays_per_camera=options.rays_per_camera,
         edge_weight=options.edge_weight,
+        restarts=options.restarts,
         seed=job.seed_for("positions"),
     )
     placed = int(np.isfinite(result.centers[:, 0]).sum())
     if placed < 2:
         raise SceneError(
             f"Scene '{job.scene}': no two images could be positioned from {len(pairs)} image pairs and "
-            f"{len(tracks.offsets) - 1} tracks: add images from different positions with more overlap."
+            f"{len(tracks.offsets) - 1} tracks: add images from different positions with more overlap, or mask borders and captions "
+            "that all images share."
         )
+    agreeing = np.count_nonzero(result.ray_residuals_rad < 4.0 * limits.sigma_rad)
+    if agreeing < DOUBTFUL_SHARE * len(result.ray_residuals_rad):
+        job.warn(DOUBTFUL.format(percent=100 * agreeing / len(result.ray_residuals_rad)))
     residuals = np.full(len(graph.pairs), np.nan)
     residuals[usable] = np.degrees(result.edge_residuals_rad)
     print(

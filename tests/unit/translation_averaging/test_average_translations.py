@@ -6,7 +6,12 @@ import pytest
 from snakesfm.geometry.rotations import angle_between
 from snakesfm.synthetic.problems import make_problem, perturb_rotations
 from snakesfm.translation_averaging.angular import refine_angles
-from snakesfm.translation_averaging.average import average_translations, normalize_gauge
+from snakesfm.translation_averaging.average import (
+    DOUBTFUL_SHARE,
+    agreeing_share,
+    average_translations,
+    normalize_gauge,
+)
 from snakesfm.translation_averaging.averagers import (
     GlobalPositioning,
     ScaleChain,
@@ -49,6 +54,49 @@ def errors(centers, truth):
     b = truth[known] - np.median(truth[known], axis=0)
     scale = np.sum(a * b) / np.sum(a * a)
     return np.linalg.norm(scale * a - b - np.median(scale * a - b, axis=0), axis=1)
+
+
+class Misled:
+    """First positions that have nothing to do with the scene."""
+
+    def position(self, problem, seed):
+        return np.random.default_rng(seed).normal(size=(problem.image_count, 3))
+
+
+@pytest.mark.parametrize("restarts", [0, 2])
+def test_positions_with_which_few_rays_agree_are_looked_for_again(restarts):
+    truth = make_problem(20, 1500, "street", noise_px=0.3, rotation_noise_deg=0.05, seed=2)
+    problem = positioning(truth)
+    found = average_translations(problem, Misled(), LIMITS, refine=False, restarts=restarts)
+    share = agreeing_share(problem, found.centers, LIMITS)
+    size = np.ptp(truth.centers, axis=0).max()
+    if restarts:
+        assert share > 0.9
+        assert np.isfinite(found.centers[:, 0]).sum() >= 19
+        assert np.median(errors(found.centers, truth.centers)) < 0.02 * size
+    else:
+        assert share < DOUBTFUL_SHARE
+        known = np.isfinite(found.centers[:, 0]).sum()
+        assert known < 15 or np.median(errors(found.centers, truth.centers)) > 0.05 * size
+
+
+def test_positions_with_which_rays_agree_are_final():
+    problem = positioning(make_problem(12, 600, "area", noise_px=0.3, rotation_noise_deg=0.05, seed=3))
+    once = average_translations(problem, ScaleChain(), LIMITS)
+    again = average_translations(problem, ScaleChain(), LIMITS, restarts=3)
+    for name, values in vars(once).items():
+        np.testing.assert_array_equal(getattr(again, name), values)
+
+
+def test_rays_of_images_without_a_centre_do_not_agree():
+    truth = make_problem(12, 600, "area", noise_px=0.0, rotation_noise_deg=0.0, seed=3)
+    problem = positioning(truth)
+    assert agreeing_share(problem, truth.centers, LIMITS) > 0.99
+    lost = truth.centers.copy()
+    lost[:3] = np.nan
+    seen = np.mean(~np.isin(problem.ray_images, [0, 1, 2]))
+    assert seen - 0.05 < agreeing_share(problem, lost, LIMITS) <= seen + 1e-12
+    assert agreeing_share(problem.select_rays(np.zeros(len(problem.rays), bool)), lost, LIMITS) == 1.0
 
 
 def test_directions_point_from_camera_i_to_camera_j():
