@@ -97,8 +97,8 @@ def run(job: StageJob) -> None:
     if placed < 2:
         raise SceneError(
             f"Scene '{job.scene}': no two images could be positioned from {len(pairs)} image pairs and "
-            f"{len(tracks.offsets) - 1} tracks: add images from different positions with more overlap, or mask borders and captions "
-            "that all images share."
+            f"{len(tracks.offsets) - 1} tracks: add images from different positions with more overlap, or "
+            "mask borders and captions that all images share."
         )
     agreeing = np.count_nonzero(result.ray_residuals_rad < 4.0 * limits.sigma_rad)
     if agreeing < DOUBTFUL_SHARE * len(result.ray_residuals_rad):
