@@ -4,7 +4,7 @@ Such matches stand still while the camera moves. They agree with each other perf
 so that neither the relative poses nor the cycles of the view graph refuse them.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
@@ -62,32 +62,39 @@ def find_overlay_cells(pairs: Iterable[tuple[tuple[int, int], Array, Array]], sh
     return np.concatenate(rows)
 
 
-def find_moving_matches(cells: Array, sizes: Array, first: Array, second: Array) -> Array:
-    """Which matches (K,) of a pair do not stand still in a cell of an overlay.
+def cover_images(cells: Array) -> dict[tuple[int, int], Array]:
+    """Which cells (columns, rows) bool an overlay covers, by the width and height of images.
 
     Parameters
     ----------
     cells : of :func:`find_overlay_cells`.
+    """
+    covered = {}
+    for size in np.unique(cells[:, :2], axis=0).tolist():
+        own = cells[(cells[:, :2] == size).all(axis=1), 2:]
+        grid = np.zeros(_grid_of(size), dtype=bool)
+        grid[own[:, 0], own[:, 1]] = True
+        covered[size[0], size[1]] = grid
+    return covered
+
+
+def find_moving_matches(
+    covered: Mapping[tuple[int, int], Array], sizes: Array, first: Array, second: Array
+) -> Array:
+    """Which matches (K,) of a pair do not stand still in a cell of an overlay.
+
+    Parameters
+    ----------
+    covered : of :func:`cover_images`.
     sizes : (2,2) width and height of the two images in detector pixels.
     first, second : (K,2) matched keypoints.
     """
-    own = cells[(cells[:, :2] == sizes[0]).all(axis=1), 2:]
-    if not len(own) or (sizes[0] != sizes[1]).any():
+    grid = covered.get((int(sizes[0, 0]), int(sizes[0, 1])))
+    if grid is None or (sizes[0] != sizes[1]).any():
         return np.ones(len(first), dtype=bool)
-    covered = np.zeros(_grid_of(sizes[0]), dtype=bool)
-    covered[own[:, 0], own[:, 1]] = True
-    at = _cells_of(first).clip(0, np.array(covered.shape) - 1)
-    still: Array = covered[at[:, 0], at[:, 1]] & _stand_still(first, second, DROPPED_PX)
+    at = _cells_of(first).clip(0, np.array(grid.shape) - 1)
+    still: Array = grid[at[:, 0], at[:, 1]] & _stand_still(first, second, DROPPED_PX)
     return ~still
-
-
-def covered_shares(cells: Array) -> dict[tuple[int, int], float]:
-    """Share of an image's cells that an overlay covers, by width and height in detector pixels."""
-    sizes, counts = np.unique(cells[:, :2], axis=0, return_counts=True)
-    return {
-        (int(w), int(h)): count / np.prod(_grid_of((w, h)))
-        for (w, h), count in zip(sizes.tolist(), counts.tolist(), strict=True)
-    }
 
 
 def _stand_still(first: Array, second: Array, limit_px: float) -> Array:

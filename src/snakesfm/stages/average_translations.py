@@ -100,7 +100,7 @@ def run(job: StageJob) -> None:
             f"{len(tracks.offsets) - 1} tracks: add images from different positions with more overlap, or "
             "mask borders and captions that all images share."
         )
-    agreeing = np.count_nonzero(result.ray_residuals_rad < 4.0 * limits.sigma_rad)
+    agreeing = np.count_nonzero(result.ray_residuals_rad < limits.ray_rad)
     if agreeing < DOUBTFUL_SHARE * len(result.ray_residuals_rad):
         job.warn(DOUBTFUL.format(percent=100 * agreeing / len(result.ray_residuals_rad)))
     residuals = np.full(len(graph.pairs), np.nan)

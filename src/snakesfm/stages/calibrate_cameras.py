@@ -1,6 +1,6 @@
 """Stage calibrate_cameras: unknown focal lengths from the matches."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,7 +19,7 @@ from snakesfm.geometry.detector_pixels import (
     reduce_keypoints,
     restore_cameras,
 )
-from snakesfm.matching.overlays import covered_shares, find_moving_matches, find_overlay_cells
+from snakesfm.matching.overlays import cover_images, find_moving_matches, find_overlay_cells
 from snakesfm.stages.job import StageJob
 
 if TYPE_CHECKING:
@@ -53,9 +53,10 @@ def run(job: StageJob) -> None:
     cells = np.zeros((0, 4), dtype=np.int32)
     if options.overlay_share:
         cells = find_overlay_cells(matched.of_one_size(OVERLAY_PAIRS), options.overlay_share)
+    covered = cover_images(cells)
     if options.estimate_focals and not given.all():
-        cameras, sigmas, counts = _calibrate(job, index, cameras, matched, cells)
-    warnings = [OVERLAY.format(percent=100 * share) for share in covered_shares(cells).values()]
+        cameras, sigmas, counts = _calibrate(job, index, cameras, matched, covered)
+    warnings = [OVERLAY.format(percent=100 * grid.mean()) for grid in covered.values()]
     models, sizes, params, sources = cameras_to_columns(cameras)
     CalibratedCameras(
         np.array(models, dtype=object),
@@ -73,7 +74,11 @@ def run(job: StageJob) -> None:
 
 
 def _calibrate(
-    job: StageJob, index: ImageIndex, cameras: list[Camera], matched: "_MatchedImages", cells: Array
+    job: StageJob,
+    index: ImageIndex,
+    cameras: list[Camera],
+    matched: "_MatchedImages",
+    covered: Mapping[tuple[int, int], Array],
 ) -> tuple[list[Camera], Array, Array]:
     # not needed where all cameras are given
     from snakesfm.calibration.focal import MatchedPair, calibrate_focals, choose_pairs
@@ -92,7 +97,7 @@ def _calibrate(
     pairs: dict[int, MatchedPair] = {}
     for row, first, second in matched.read(chosen):
         i, j = matched.pairs[row].tolist()
-        moving = find_moving_matches(cells, matched.sizes[[i, j]], first, second)
+        moving = find_moving_matches(covered, matched.sizes[[i, j]], first, second)
         pairs[row] = MatchedPair(
             int(index.camera_ids[i]),
             int(index.camera_ids[j]),

@@ -21,7 +21,7 @@ from snakesfm.geometry.detector_pixels import (
     reduce_keypoints,
 )
 from snakesfm.grouping import offsets_of
-from snakesfm.matching.overlays import find_moving_matches
+from snakesfm.matching.overlays import cover_images, find_moving_matches
 from snakesfm.stages.job import StageJob
 from snakesfm.two_view.correspondences import first_rows_at_place, unify_matches
 from snakesfm.two_view.estimate import TwoViewEstimate, estimate_two_view_geometry
@@ -57,11 +57,12 @@ def run(job: StageJob) -> None:
     cameras_of = [(of_camera[index.camera_ids[i]], of_camera[index.camera_ids[j]]) for i, j in pairs]
     seeds = [job.seed_for(str(index.names[i]), str(index.names[j])) for i, j in pairs]
     sizes = detector_sizes(index.sizes, job.settings)
+    covered = cover_images(cameras.overlay_cells)
     used = []
     for k, (i, j) in enumerate(pairs):
         best = _best_first(matches, k)
         first, second = keypoints[i][best[:, 0]], keypoints[j][best[:, 1]]
-        used.append(best[find_moving_matches(cameras.overlay_cells, sizes[[i, j]], first, second)])
+        used.append(best[find_moving_matches(covered, sizes[[i, j]], first, second)])
     digests = [
         _digest(used[k], (image_digests[i], image_digests[j]), cameras_of[k], options, seeds[k])
         for k, (i, j) in enumerate(pairs)

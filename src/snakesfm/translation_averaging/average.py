@@ -130,7 +130,7 @@ def average_translations(
 
 
 def agreeing_share(problem: PositioningProblem, centers: Array, limits: SupportLimits) -> float:
-    """Share of the rays that pass by their landmarks within four standard deviations.
+    """Share of the rays that pass by their landmarks within the limit of a ray.
 
     Rays of images without a centre do not; the share of no rays is 1.
     """
@@ -139,7 +139,7 @@ def agreeing_share(problem: PositioningProblem, centers: Array, limits: SupportL
         return float(not len(known))
     seen = problem.select_rays(known)
     angles = angles_rad(seen, centers, _landmarks(seen, centers))
-    return float(np.count_nonzero(angles < 4.0 * limits.sigma_rad) / len(known))
+    return float(np.count_nonzero(angles < limits.ray_rad) / len(known))
 
 
 def largest_part(problem: PositioningProblem) -> PositioningProblem:

@@ -20,6 +20,7 @@ from snakesfm.translation_averaging.problem import PositioningProblem
 Array = NDArray[Any]
 
 TELLING_SIGHTS = 3
+RAY_SIGMAS = 4.0
 
 
 @dataclass(frozen=True)
@@ -43,6 +44,11 @@ class SupportLimits:
     min_ratio: float = 0.5
     max_relative_sigma: float = 0.1
 
+    @property
+    def ray_rad(self) -> float:
+        """Angle within which a ray counts."""
+        return RAY_SIGMAS * self.sigma_rad
+
 
 def held_cameras(
     problem: PositioningProblem, centers: Array, points: Array, limits: SupportLimits
@@ -60,7 +66,7 @@ def held_cameras(
     sigma = usual_error_rad(angles, limits.sigma_rad)
     by_rays = _held(
         problem.ray_images,
-        angles < 4.0 * sigma,
+        angles < RAY_SIGMAS * sigma,
         points[problem.ray_tracks] - centers[problem.ray_images],
         sigma,
         limits.min_support,

@@ -4,10 +4,10 @@ import io
 
 import numpy as np
 import pytest
+from plain_index import write_plain_index
 
-from snakesfm.artifacts import Header, ImageIndex, LocalFeatures, PairMatches, TwoViewGeometries
+from snakesfm.artifacts import Header, LocalFeatures, PairMatches, TwoViewGeometries
 from snakesfm.config.export_hloc import ExportHlocOptions
-from snakesfm.geometry.camera import PARAM_SLOTS
 from snakesfm.stages import export_hloc
 from snakesfm.stages.job import Progress, StageJob
 
@@ -17,24 +17,7 @@ def export(folder, names, pairs):
     count = len(names)
     header = Header("stage", 1, "scene")
     index, features, matches, geometries = (folder / f"{name}.h5" for name in "ifmg")
-    ImageIndex(
-        names=names,
-        sizes=np.tile([320, 240], (count, 1)),
-        sha256=names,
-        blocks=np.zeros(count, int),
-        camera_ids=np.zeros(count, int),
-        orientations=np.ones(count, int),
-        focal_exif_px=np.full(count, np.nan),
-        gps=np.full((count, 3), np.nan),
-        duplicate_of=np.full(count, -1),
-        camera_models=["PINHOLE"],
-        camera_sizes=[[320, 240]],
-        camera_params=np.full((1, PARAM_SLOTS), np.nan),
-        camera_sources=["given"],
-        refused_names=[],
-        refused_reasons=[],
-        warnings=[],
-    ).write(index, header)
+    write_plain_index(index, names, [(320, 240)] * count, names)
     LocalFeatures(
         image_ids=np.arange(count),
         names=names,

@@ -2,43 +2,21 @@
 
 import numpy as np
 import pytest
+from plain_index import write_plain_index
 from scipy.spatial.transform import Rotation
 
-from snakesfm.artifacts.images import ImageIndex
 from snakesfm.artifacts.mapping import CameraRotations
 from snakesfm.artifacts.pairs import EDGE_LABELS, TwoViewGeometries, ViewGraph
 from snakesfm.config.average_rotations import AverageRotationsOptions
 from snakesfm.config.build_view_graph import BuildViewGraphOptions
 from snakesfm.config.filter_view_graph import FilterViewGraphOptions
 from snakesfm.errors import SceneError
-from snakesfm.geometry.camera import PARAM_SLOTS
 from snakesfm.geometry.rotations import angle_of
 from snakesfm.stages import average_rotations, build_view_graph, filter_view_graph
 from snakesfm.stages.job import StageJob
 
 IMAGES = 14
 GROUP = 11
-
-
-def write_index(path, header):
-    ImageIndex(
-        names=[f"{row:02d}.jpg" for row in range(IMAGES)],
-        sizes=np.tile([640, 480], (IMAGES, 1)),
-        sha256=["0"] * IMAGES,
-        blocks=np.zeros(IMAGES, int),
-        camera_ids=np.zeros(IMAGES, int),
-        orientations=np.ones(IMAGES, int),
-        focal_exif_px=np.full(IMAGES, np.nan),
-        gps=np.full((IMAGES, 3), np.nan),
-        duplicate_of=np.full(IMAGES, -1),
-        camera_models=["PINHOLE"],
-        camera_sizes=np.array([[640, 480]]),
-        camera_params=np.full((1, PARAM_SLOTS), np.nan),
-        camera_sources=["default"],
-        refused_names=[],
-        refused_reasons=[],
-        warnings=[],
-    ).write(path, header)
 
 
 def geometries(pairs, rotations, rejections):
@@ -82,7 +60,8 @@ def scene(tmp_path):
         )
 
     header = job("index_images", BuildViewGraphOptions(), "index").header
-    write_index(tmp_path / "index.h5", header)
+    names = [f"{row:02d}.jpg" for row in range(IMAGES)]
+    write_plain_index(tmp_path / "index.h5", names, [(640, 480)] * IMAGES, ["0"] * IMAGES)
     tiles = []
     for tile in range(3):
         rows = np.arange(len(pairs)) % 3 == 2 - tile
