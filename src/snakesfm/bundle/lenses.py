@@ -8,11 +8,10 @@ from numpy.typing import NDArray
 
 from snakesfm.bundle.interface import BundleAdjuster, SolverSettings
 from snakesfm.bundle.principal_points import shared_cameras
-from snakesfm.bundle.reading import read_tracks_and_pixels
+from snakesfm.bundle.reading import points_in_cameras, read_tracks_and_pixels
 from snakesfm.geometry.camera import Camera
 from snakesfm.geometry.colmap_binding import pycolmap
 from snakesfm.geometry.lens_fit import MAX_MISFIT, LensFit, fit_lenses
-from snakesfm.grouping import rows_of_each
 
 Array = NDArray[Any]
 
@@ -67,11 +66,7 @@ def _fits(reconstruction: pycolmap.Reconstruction, camera_ids: Collection[int]) 
     if not camera_ids:
         return {}
     tracks, pixels = read_tracks_and_pixels(reconstruction)
-    camera_of, in_camera = np.empty(len(pixels), dtype=np.int64), np.empty((len(pixels), 3))
-    for image, mine in rows_of_each(tracks.images):
-        shot = reconstruction.image(image + 1)
-        camera_of[mine] = shot.camera_id
-        in_camera[mine] = shot.cam_from_world() * tracks.points[tracks.point_rows[mine]]
+    camera_of, in_camera = points_in_cameras(reconstruction, tracks)
     cameras = {camera_id: Camera.of_pycolmap(reconstruction.camera(camera_id)) for camera_id in camera_ids}
     return fit_lenses(cameras, camera_of, tracks.images, in_camera, pixels)
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from snakesfm.bundle.interface import BundleAdjuster, SolverSettings
-from snakesfm.bundle.reading import read_tracks_and_pixels
+from snakesfm.bundle.reading import points_in_cameras, read_tracks_and_pixels
 from snakesfm.geometry.colmap_binding import pycolmap
 from snakesfm.geometry.lens_fit import MIN_IMAGES
 from snakesfm.grouping import rows_of_each
@@ -133,10 +133,9 @@ def _adjusted_half(
 def _median_errors(reconstruction: pycolmap.Reconstruction) -> dict[int, float]:
     """Median reprojection errors in pixels, by the ids of the cameras that have observations."""
     tracks, pixels = read_tracks_and_pixels(reconstruction)
-    camera_of, errors = np.empty(len(pixels), dtype=np.int64), np.empty(len(pixels))
-    for row, mine in rows_of_each(tracks.images):
-        image = reconstruction.image(row + 1)
-        in_camera = image.cam_from_world() * tracks.points[tracks.point_rows[mine]]
-        camera_of[mine] = image.camera_id
-        errors[mine] = np.linalg.norm(image.camera.img_from_cam(in_camera) - pixels[mine], axis=1)
-    return {int(camera_id): float(np.median(errors[mine])) for camera_id, mine in rows_of_each(camera_of)}
+    camera_of, in_camera = points_in_cameras(reconstruction, tracks)
+    medians = {}
+    for camera_id, mine in rows_of_each(camera_of):
+        seen = reconstruction.camera(camera_id).img_from_cam(in_camera[mine])
+        medians[int(camera_id)] = float(np.median(np.linalg.norm(seen - pixels[mine], axis=1)))
+    return medians

@@ -60,6 +60,16 @@ def read_tracks_and_pixels(reconstruction: pycolmap.Reconstruction) -> tuple[Tra
         return tracks, _pixels(folder / IMAGES_FILE, tracks)
 
 
+def points_in_cameras(reconstruction: pycolmap.Reconstruction, tracks: Tracks) -> tuple[Array, Array]:
+    """Id of the camera (L,) int64 of each observation, and its point (L,3) in the camera's frame."""
+    camera_of, points = np.empty(len(tracks.images), dtype=np.int64), np.empty((len(tracks.images), 3))
+    for row, mine in rows_of_each(tracks.images):
+        image = reconstruction.image(row + 1)
+        camera_of[mine] = image.camera_id
+        points[mine] = image.cam_from_world() * tracks.points[tracks.point_rows[mine]]
+    return camera_of, points
+
+
 def _tracks(path: Path) -> Tracks:
     content = path.read_bytes()
     (count,) = COUNT.unpack_from(content)
