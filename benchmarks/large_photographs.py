@@ -16,8 +16,8 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from snakesfm.arrays import Array
 from snakesfm.geometry.camera import Camera
 from snakesfm.geometry.poses import translation_of
 from snakesfm.seeding import derive_seed
@@ -25,7 +25,6 @@ from snakesfm.synthetic.raster import Face, Texture, View
 from snakesfm.synthetic.render_demo import write_scene
 from snakesfm.synthetic.scene import look_at, sample_points
 
-Array = NDArray[Any]
 FOCAL_35MM = 28.0
 BLUR_PX = 0.7
 POINTS = 4000

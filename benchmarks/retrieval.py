@@ -13,21 +13,19 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from benchmarks import ROOT
 from benchmarks.compare.measure import CommandError, run_measured
 from benchmarks.compare.sets import ImageSet
 from benchmarks.markdown import markdown_head, markdown_row
 from benchmarks.on_sets import Run, SetTable, Value, finished
+from snakesfm.arrays import Array
 from snakesfm.artifacts import GlobalDescriptors, ImageIndex
 from snakesfm.config.select_pairs import SelectPairsOptions
 from snakesfm.evaluation.colmap_model import read_model
 from snakesfm.retrieval.pairs import natural_key, similarities_of
 from snakesfm.retrieval.preview import look_at_pairs
 from snakesfm.stages.select_pairs import read_previews
-
-Array = NDArray[Any]
 
 PAGE = ROOT / "docs" / "retrieval.md"
 SHARED_POINTS = 10

@@ -10,9 +10,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[Any]
+from snakesfm.arrays import Array
 
 MEMORY_BYTES = 8 << 30
 LIBRARIES = ("gtsam", "pycolmap", "scipy.sparse.linalg", "scipy.sparse.csgraph", "scipy.spatial")

@@ -1,14 +1,10 @@
 """Errors against the truth."""
 
-from typing import Any
-
 import numpy as np
-from numpy.typing import NDArray
 
+from snakesfm.arrays import Array
 from snakesfm.evaluation.alignment import align_poses, median_rotation
 from snakesfm.geometry.rotations import angle_of
-
-Array = NDArray[Any]
 
 
 def rotation_errors_deg(averaged: Array, truth: Array) -> Array:

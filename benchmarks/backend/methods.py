@@ -1,12 +1,11 @@
 """What is compared: snakesfm's filters and averagers, pycolmap's, and the best possible."""
 
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from benchmarks.backend.problems import Problem
+from snakesfm.arrays import Array
 from snakesfm.config.filter_view_graph import FilterViewGraphOptions
 from snakesfm.rotation_averaging.base import RotationGraph
 from snakesfm.rotation_averaging.linear import apply_increments, solve_anisotropic, world_residuals
@@ -16,8 +15,6 @@ from snakesfm.rotation_averaging.verification import average_view_graph
 from snakesfm.stages.filter_view_graph import refuse_edges
 from snakesfm.view_graph.cycles import find_cycles
 from snakesfm.view_graph.filters import keep_largest_component
-
-Array = NDArray[Any]
 
 FILTERS = {
     "messages": FilterViewGraphOptions(),

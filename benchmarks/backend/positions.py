@@ -1,12 +1,11 @@
 """What positions cameras, given their rotations: snakesfm's averagers, and pycolmap's as it comes."""
 
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from benchmarks.backend.problems import Problem
+from snakesfm.arrays import Array
 from snakesfm.rotation_averaging.base import edge_residuals
 from snakesfm.rotation_averaging.rejection import residual_limit
 from snakesfm.translation_averaging.average import average_translations
@@ -18,8 +17,6 @@ from snakesfm.translation_averaging.problem import (
     world_rays,
 )
 from snakesfm.translation_averaging.support import SupportLimits
-
-Array = NDArray[Any]
 
 COLMAP_LOSS_SCALE = 0.1
 COLMAP_MIN_VIEWS = 3

@@ -7,12 +7,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from snakesfm.arrays import Array
 from snakesfm.synthetic.problems import Layout, make_problem
-
-Array = NDArray[Any]
 
 LAYOUTS: tuple[Layout, ...] = ("ring", "street", "area", "facade")
 

@@ -1,12 +1,11 @@
 """Rows of arrays that belong together."""
 
 import math
-from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Array = NDArray[Any]
+from snakesfm.arrays import Array
 
 
 def rows_of_each(values: Array) -> list[tuple[int, Array]]:

@@ -3,12 +3,10 @@
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import PurePosixPath
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[Any]
+from snakesfm.arrays import Array
 
 
 def match_names(names: Sequence[str], reference_names: Sequence[str]) -> Array:

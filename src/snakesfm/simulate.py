@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from snakesfm.arrays import Array
 from snakesfm.artifacts.base import Header, atomic_path
 from snakesfm.artifacts.features import LocalFeatures
 from snakesfm.artifacts.images import CalibratedCameras, ImageIndex
@@ -30,8 +30,6 @@ from snakesfm.synthetic.pairing import candidate_pairs, choose_partners, simulat
 from snakesfm.synthetic.sightings import DetectorModel, DistinctLooks, match_looks, sight
 from snakesfm.synthetic.simulation_options import UNTIL, SimulationOptions, parse_arguments
 from snakesfm.synthetic.surveys import SURVEYS, Survey
-
-Array = NDArray[Any]
 
 # per image the landmark ids of its keypoints, and those keypoints that can be matched
 Truths = dict[int, tuple[Array, DistinctLooks]]

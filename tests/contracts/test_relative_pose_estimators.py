@@ -5,11 +5,11 @@ from typing import Any, ClassVar
 import numpy as np
 import pytest
 
+from snakesfm.arrays import Array
 from snakesfm.geometry.rotations import angle_between, angle_of, exp_so3
 from snakesfm.two_view.estimators import ESTIMATORS, PoseEstimator
 from snakesfm.two_view.sampson import Correspondences
 
-Array = np.ndarray[Any, Any]
 FOCAL = 800.0
 
 

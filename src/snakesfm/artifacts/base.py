@@ -19,12 +19,11 @@ from typing import Any, ClassVar, Self
 
 import h5py
 import numpy as np
-from numpy.typing import NDArray
 
 import snakesfm
+from snakesfm.arrays import Array
 from snakesfm.errors import ArtifactError
 
-Array = NDArray[Any]
 TEMPORARY = ".export."
 STRING = h5py.string_dtype("utf-8")
 

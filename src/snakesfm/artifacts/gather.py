@@ -2,16 +2,13 @@
 
 from collections.abc import Collection, Iterable, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from snakesfm.arrays import Array
 from snakesfm.artifacts.features import LocalFeatures
 from snakesfm.artifacts.pairs import REJECTIONS, TwoViewGeometries
 from snakesfm.grouping import offsets_of
-
-Array = NDArray[Any]
 
 
 def gather_image_columns(

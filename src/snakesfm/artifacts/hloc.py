@@ -13,12 +13,10 @@ from typing import Any
 
 import h5py
 import numpy as np
-from numpy.typing import NDArray
 
+from snakesfm.arrays import Array
 from snakesfm.errors import ConfigError
 from snakesfm.hloc_files import FEATURES, MATCHES, PAIRS
-
-Array = NDArray[Any]
 
 CENTER_SHIFT = np.float32(0.5)
 # old versions joined the names of a pair by another sign

@@ -3,7 +3,8 @@
 from dataclasses import dataclass
 from typing import ClassVar
 
-from snakesfm.artifacts.base import Array, Artifact, column
+from snakesfm.arrays import Array
+from snakesfm.artifacts.base import Artifact, column
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,8 @@ from typing import ClassVar
 
 import numpy as np
 
-from snakesfm.artifacts.base import Array, Artifact, column
+from snakesfm.arrays import Array
+from snakesfm.artifacts.base import Artifact, column
 from snakesfm.grouping import offsets_of
 
 

@@ -10,15 +10,12 @@ warp of a plane that faces the cameras.
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from snakesfm.arrays import Array
 from snakesfm.grouping import rows_of_each
-
-Array = NDArray[Any]
 
 MAX_MOVE_PX = 1.5
 """An observation that moves farther has left its point; SIFT is off by a few tenths."""

@@ -1,15 +1,12 @@
 """Completion of the model: tracks are completed and merged, points triangulated from unused matches."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from snakesfm.arrays import Array
 from snakesfm.bundle.reading import read_tracks
 from snakesfm.geometry.colmap_binding import pycolmap
-
-Array = NDArray[Any]
 
 # pycolmap takes no angle of zero
 SMALLEST_ANGLE_DEG = 1e-9

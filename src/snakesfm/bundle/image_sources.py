@@ -4,16 +4,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from snakesfm.arrays import Array
 from snakesfm.bundle.alignment import AlignmentSettings, GrayImage
 from snakesfm.errors import ImageError
-
-Array = NDArray[Any]
 
 HELD_PIXELS = 256 * 760 * 1140
 """Gray values that are kept, as each image is read twice: those of so many photographs of usual size."""

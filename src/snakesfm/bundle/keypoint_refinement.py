@@ -1,11 +1,10 @@
 """Refinement of a reconstruction's keypoints by aligning them to each other in the images."""
 
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from snakesfm.arrays import Array
 from snakesfm.bundle.alignment import (
     AlignmentSettings,
     GrayImage,
@@ -15,8 +14,6 @@ from snakesfm.bundle.alignment import (
 from snakesfm.bundle.reading import read_tracks_and_pixels
 from snakesfm.geometry.colmap_binding import pycolmap
 from snakesfm.grouping import rows_of_each
-
-Array = NDArray[Any]
 
 MIN_ALIGNED_SHARE = 0.75
 """Where fewer of the observations can be aligned, the image or scene is blurred or of changing light."""

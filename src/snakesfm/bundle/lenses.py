@@ -1,10 +1,8 @@
 """Replacement of camera models that do not describe the lens by a more general one."""
 
 from collections.abc import Collection
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from snakesfm.bundle.interface import BundleAdjuster, SolverSettings
 from snakesfm.bundle.principal_points import shared_cameras
@@ -12,8 +10,6 @@ from snakesfm.bundle.reading import points_in_cameras, read_tracks_and_pixels
 from snakesfm.geometry.camera import Camera
 from snakesfm.geometry.colmap_binding import pycolmap
 from snakesfm.geometry.lens_fit import MAX_MISFIT, LensFit, fit_lenses
-
-Array = NDArray[Any]
 
 WIDER_MODEL = "OPENCV_FISHEYE"
 """It has four terms of the angle, so it describes perspective lenses with strong distortion, too."""

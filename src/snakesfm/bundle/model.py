@@ -5,19 +5,16 @@ Ids of cameras, images and frames in the reconstruction are rows plus one.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from snakesfm.arrays import Array
 from snakesfm.bundle.reading import read_tracks_and_pixels
 from snakesfm.geometry.camera import Camera, observation_errors
 from snakesfm.geometry.colmap_binding import pycolmap
 from snakesfm.geometry.colmap_writing import with_observations
 from snakesfm.geometry.poses import to_rigid3d
 from snakesfm.grouping import offsets_of
-
-Array = NDArray[Any]
 
 
 @dataclass(frozen=True)

@@ -2,17 +2,14 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from snakesfm.arrays import Array
 from snakesfm.bundle.model import BundleModel
 from snakesfm.geometry.camera import Camera
 from snakesfm.grouping import offsets_of
 from snakesfm.view_graph.components import label_components
-
-Array = NDArray[Any]
 
 
 def tied_images(pairs: Array, posed: Array) -> Array:

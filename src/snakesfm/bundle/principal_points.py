@@ -2,18 +2,15 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from snakesfm.arrays import Array
 from snakesfm.bundle.interface import BundleAdjuster, SolverSettings
 from snakesfm.bundle.reading import points_in_cameras, read_tracks_and_pixels
 from snakesfm.geometry.colmap_binding import pycolmap
 from snakesfm.geometry.lens_fit import MIN_IMAGES
 from snakesfm.grouping import rows_of_each
-
-Array = NDArray[Any]
 
 # what is no farther than this many gaps from where it is assumed may as well be there
 SIGNIFICANCE = 3.0

@@ -3,11 +3,10 @@
 import struct
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from snakesfm.arrays import Array
 from snakesfm.geometry.colmap_binding import pycolmap
 from snakesfm.geometry.colmap_files import (
     COUNT,
@@ -20,8 +19,6 @@ from snakesfm.geometry.colmap_files import (
     written_files,
 )
 from snakesfm.grouping import rows_of_each
-
-Array = NDArray[Any]
 
 
 @dataclass(frozen=True)

@@ -2,16 +2,13 @@
 
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from snakesfm.arrays import Array
 from snakesfm.bundle.reading import read_tracks
 from snakesfm.bundle.resection import resect
 from snakesfm.geometry.colmap_binding import pycolmap
-
-Array = NDArray[Any]
 
 
 def register_left_out(

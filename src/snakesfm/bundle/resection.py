@@ -2,16 +2,13 @@
 
 import copy
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import poselib
-from numpy.typing import NDArray
 
+from snakesfm.arrays import Array
 from snakesfm.geometry.colmap_binding import pycolmap
 from snakesfm.geometry.poses import to_rigid3d
-
-Array = NDArray[Any]
 
 MINIMAL_SAMPLE = 4
 # one more unknown has to explain this many times the matches to be believed

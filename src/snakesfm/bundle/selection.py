@@ -1,11 +1,10 @@
 """Adjustment of large models with a selection of their points; the others follow with fixed cameras."""
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from snakesfm.arrays import Array
 from snakesfm.bundle.interface import BundleAdjuster, SolverSettings
 from snakesfm.bundle.model import BundleModel, to_reconstruction
 from snakesfm.bundle.reading import read_tracks, read_tracks_and_pixels
@@ -13,8 +12,6 @@ from snakesfm.geometry.camera import Camera
 from snakesfm.geometry.colmap_binding import pycolmap
 from snakesfm.geometry.colmap_writing import keypoints_of_observations
 from snakesfm.grouping import rows_of_each
-
-Array = NDArray[Any]
 
 STEPS = 5
 OBSERVATIONS_AT_ONCE = 500_000

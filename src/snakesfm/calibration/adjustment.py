@@ -7,10 +7,10 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import coo_array, diags_array
 from scipy.sparse.linalg import splu
 
+from snakesfm.arrays import Array
 from snakesfm.calibration.condensed import (
     NOISE_FLOOR_PX,
     CondensedPairs,
@@ -28,7 +28,6 @@ from snakesfm.two_view.sampson import (
     sampson_jacobian,
 )
 
-Array = NDArray[Any]
 ITERATIONS = 15
 # from focal lengths that condensed pairs agree on
 FINAL_ITERATIONS = 3

@@ -6,15 +6,13 @@ With it, steps cost the same however many points there are, and are made for all
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from snakesfm.arrays import Array
 from snakesfm.calibration.epipolar import EpipolarPair, cameras_of
 from snakesfm.geometry.rotations import GENERATORS, exp_so3
 
-Array = NDArray[Any]
 NOISE_FLOOR_PX = 0.2
 # these fits only find where the adjustment to all points starts
 MAX_POINTS = 100

@@ -2,15 +2,13 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import poselib
-from numpy.typing import NDArray
 
+from snakesfm.arrays import Array
 from snakesfm.geometry.robust import robust_sigma
 
-Array = NDArray[Any]
 MAX_POINTS = 400
 FEWEST_INLIERS = 20
 # pairs that draw more are seldom usable and take most of the time

@@ -3,11 +3,11 @@
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from snakesfm.arrays import Array
 from snakesfm.calibration.adjustment import Each, FocalAdjustment, adjust_condensed, adjust_focals
 from snakesfm.calibration.condensed import condense_pairs
 from snakesfm.calibration.epipolar import EpipolarPair, estimate_epipolar_pair
@@ -18,7 +18,6 @@ from snakesfm.geometry.camera import Camera
 if TYPE_CHECKING:
     from snakesfm.config.calibrate_cameras import CalibrateCamerasOptions
 
-Array = NDArray[Any]
 GIVEN = "given"
 EXIF = "exif"
 ESTIMATED = "estimated"

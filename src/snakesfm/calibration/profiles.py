@@ -1,14 +1,11 @@
 """Global search for one focal length at a time by the epipolar errors of its pairs."""
 
-from typing import Any
-
 import numpy as np
-from numpy.typing import NDArray
 
+from snakesfm.arrays import Array
 from snakesfm.calibration.condensed import CondensedPairs, fit_essential
 from snakesfm.calibration.epipolar import rows_of_cameras
 
-Array = NDArray[Any]
 GRID_SIZE = 14
 CAP = 4.0
 

@@ -1,14 +1,12 @@
 """Initial focal lengths: those that turn fundamental matrices into essential matrices."""
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from snakesfm.arrays import Array
 from snakesfm.calibration.epipolar import EpipolarPair, cameras_of, rows_of_cameras
 
-Array = NDArray[Any]
 GRID_SIZE = 60
 SWEEPS = 8
 VOTE_SCALE = 0.02

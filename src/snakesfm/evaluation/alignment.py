@@ -1,15 +1,12 @@
 """Robust Sim(3) alignment of camera poses to reference poses."""
 
-from typing import Any
-
 import numpy as np
-from numpy.typing import NDArray
 
+from snakesfm.arrays import Array
 from snakesfm.evaluation.pose_errors import compared_images
 from snakesfm.geometry.poses import Similarity
 from snakesfm.geometry.robust import robust_sigma
 
-Array = NDArray[Any]
 ITERATIONS = 100
 TOLERANCE = 1e-12
 MOST_PAIRS = 400_000

@@ -2,11 +2,10 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from snakesfm.arrays import Array
 from snakesfm.evaluation.alignment import align_poses
 from snakesfm.evaluation.pose_errors import (
     FAILED_DEG,
@@ -19,7 +18,6 @@ from snakesfm.geometry.poses import center_of
 from snakesfm.geometry.rotations import angle_between
 from snakesfm.image_names import match_names
 
-Array = NDArray[Any]
 Metrics = dict[str, float | int | None]
 RELATIVE_THRESHOLDS_DEG = (1.0, 3.0, 5.0, 10.0, 20.0)
 GLOBAL_THRESHOLDS_DEG = (1.0, 2.5, 5.0, 10.0, 20.0)

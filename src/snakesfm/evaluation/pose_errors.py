@@ -1,15 +1,13 @@
 """Errors of camera poses against reference poses, and the areas under their recall curves."""
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from snakesfm.arrays import Array
 from snakesfm.geometry.poses import center_of
 from snakesfm.geometry.rotations import angle_between
 
-Array = NDArray[Any]
 FAILED_DEG = 180.0
 # all pairs of 2,000 images; of more images as many pairs are drawn
 MOST_PAIRS = 4_000_000

@@ -4,14 +4,12 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from snakesfm.arrays import Array
 from snakesfm.geometry.camera import Camera
 from snakesfm.geometry.colmap_binding import pycolmap
 from snakesfm.geometry.colmap_writing import keypoints_of_observations, with_observations
 from snakesfm.geometry.poses import to_rigid3d
-
-Array = NDArray[Any]
 
 
 def registered_images(rotations: Array, translations: Array) -> Array:

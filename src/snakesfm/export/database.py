@@ -1,15 +1,12 @@
 """Features and two-view geometries as rows of a COLMAP database, through pycolmap."""
 
-from typing import Any
-
 import numpy as np
-from numpy.typing import NDArray
 
+from snakesfm.arrays import Array
 from snakesfm.geometry.camera import Camera
 from snakesfm.geometry.colmap_binding import pycolmap
 from snakesfm.geometry.poses import to_rigid3d
 
-Array = NDArray[Any]
 UNSURE_SOURCES = ("default",)
 KEYPOINT_FIELDS = 4
 

@@ -4,14 +4,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from snakesfm.arrays import Array
 from snakesfm.geometry.colmap_binding import pycolmap
 from snakesfm.geometry.earth import Origin, local_metres
 from snakesfm.geometry.poses import Similarity
 from snakesfm.geometry.robust import robust_sigma
-
-Array = NDArray[Any]
 
 # what satellite navigation without corrections errs by at worst, height included
 COARSE_ERROR_M = 20.0

@@ -6,11 +6,9 @@ import struct
 import zlib
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
-from numpy.typing import NDArray
+from snakesfm.arrays import Array
 
-Array = NDArray[Any]
 UPRIGHT = (0, 1)
 EXIF_MARK = b"Exif\0\0"
 ORIENTATION = 0x0112

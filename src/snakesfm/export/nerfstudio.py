@@ -4,12 +4,11 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from snakesfm.arrays import Array
 from snakesfm.geometry.camera import WIDE_MODELS, Camera
 from snakesfm.geometry.poses import center_of
 
-Array = NDArray[Any]
 PERSPECTIVE_TERMS = ("k1", "k2", "k3", "p1", "p2")
 FISHEYE_TERMS = ("k1", "k2", "k3", "k4")
 GRID = 25

@@ -4,18 +4,16 @@ import shutil
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from snakesfm.arrays import Array
 from snakesfm.errors import ImageError
 from snakesfm.geometry.camera import Camera
 from snakesfm.geometry.colmap_binding import pycolmap
 from snakesfm.ingest.masks import find_mask, read_mask
 
-Array = NDArray[Any]
 JPEG_SUFFIXES = (".jpg", ".jpeg")
 # COLMAP takes less for none, and it moves no pixel by a thousandth
 LEAST_DISTORTION = 1e-7

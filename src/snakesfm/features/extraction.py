@@ -3,17 +3,14 @@
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from snakesfm.arrays import Array
 from snakesfm.features.keypoints import BatchDetector, Detector, KeypointSet, pixels_at
 from snakesfm.features.sift import SiftDetector
 from snakesfm.ingest.read import scale_down
 from snakesfm.lazy_loading import lazy
-
-Array = NDArray[Any]
 
 # of masks that leave less of an image, fewer keypoints than wanted may be found
 SMALLEST_SHARE = 0.25

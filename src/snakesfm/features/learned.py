@@ -4,15 +4,13 @@ from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from snakesfm.arrays import Array
 from snakesfm.features.keypoints import KeypointSet
 from snakesfm.learned.batches import equal_rows
 from snakesfm.learned.checkpoints import fill_network
 from snakesfm.learned.device import load_torch
 from snakesfm.learned.pictures import to_array, to_tensor
-
-Array = NDArray[Any]
 
 SMALLEST_SIDE_PX = 32
 # networks put the first pixel's centre at (0, 0)

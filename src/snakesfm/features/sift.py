@@ -5,11 +5,9 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from snakesfm.arrays import Array
 from snakesfm.features.keypoints import KeypointSet
-
-Array = NDArray[Any]
 
 # entries of a unit RootSIFT vector rarely exceed one half, so 512 uses all of uint8
 ROOTSIFT_SCALE = 512.0

@@ -4,11 +4,9 @@ import importlib
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from snakesfm.arrays import Array
 from snakesfm.errors import ConfigError
-
-Array = NDArray[Any]
 
 
 class Surface:

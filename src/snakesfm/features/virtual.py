@@ -3,14 +3,11 @@
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from snakesfm.errors import ConfigError
 from snakesfm.features.keypoints import KeypointSet
 from snakesfm.features.virtual_points import ObservedPoints, PointSource, SurfacePoints, ViewPoints
 from snakesfm.geometry.colmap_binding import pycolmap
-
-Array = NDArray[Any]
 
 # of a ray's x and y at depth 1: far above rounding and far below a pixel
 RAY_TOLERANCE = 1e-5

@@ -1,15 +1,13 @@
 """Which points the oracle ``virtual`` knows, and which of them an image sees."""
 
-from typing import Any, NamedTuple, Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from snakesfm.arrays import Array
 from snakesfm.features.surface import Surface
 from snakesfm.geometry.colmap_binding import pycolmap
-
-Array = NDArray[Any]
 
 # of a point where an image observes none, times the distance to the nearest other camera
 DEPTHS = (2.0, 50.0)

@@ -2,18 +2,17 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from snakesfm.arrays import Array
 from snakesfm.geometry.poses import to_camera
 from snakesfm.grouping import rows_of_each
 
 if TYPE_CHECKING:
     import pycolmap
 
-Array = NDArray[Any]
 PARAM_SLOTS = 16
 ROUND_TRIP_PX = 1.0
 WIDE_MODELS = frozenset({"FOV", "EUCM", "SIMPLE_DIVISION", "DIVISION"})

@@ -3,11 +3,10 @@
 from collections.abc import Sequence
 from io import BytesIO
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from snakesfm.arrays import Array
 from snakesfm.geometry.colmap_binding import pycolmap
 from snakesfm.geometry.colmap_files import (
     COUNT,
@@ -21,8 +20,6 @@ from snakesfm.geometry.colmap_files import (
     written_files,
 )
 from snakesfm.grouping import rows_of_each
-
-Array = NDArray[Any]
 
 NO_ERROR = -1.0
 """What pycolmap holds for a point whose reprojection error was not computed."""

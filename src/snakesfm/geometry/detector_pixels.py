@@ -10,12 +10,10 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from snakesfm.arrays import Array
 from snakesfm.geometry.camera import Camera
 from snakesfm.geometry.detector_sides import LEAST_SIDE_PX, LONGER_SIDE, SHORTER_SIDE
-
-Array = NDArray[Any]
 
 
 def detector_scales(sizes: Array, settings: Mapping[str, Any]) -> Array:

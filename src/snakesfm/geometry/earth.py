@@ -1,11 +1,9 @@
 """Positions on the earth in a local coordinate frame in metres."""
 
-from typing import Any
-
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[Any]
+from snakesfm.arrays import Array
+
 Origin = tuple[float, float, float]
 
 

@@ -2,16 +2,13 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from snakesfm.arrays import Array
 from snakesfm.geometry.camera import Camera
 from snakesfm.geometry.robust import robust_sigma
 from snakesfm.grouping import rows_of_each
-
-Array = NDArray[Any]
 
 MAX_MISFIT = 0.2
 """Models that fit have 0.01 to 0.13."""

@@ -1,15 +1,14 @@
 """Rigid poses as arrays, the way to pycolmap's, and similarities between worlds."""
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
+
+from snakesfm.arrays import Array
 
 if TYPE_CHECKING:
     import pycolmap
-
-Array = NDArray[Any]
 
 
 @dataclass(frozen=True)

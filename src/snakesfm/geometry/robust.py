@@ -1,11 +1,9 @@
 """Statistics that withstand wrong values."""
 
-from typing import Any
-
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[Any]
+from snakesfm.arrays import Array
+
 MAD_TO_SIGMA = 1.4826
 
 

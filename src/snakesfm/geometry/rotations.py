@@ -4,12 +4,10 @@ Exponential and logarithm are plain numpy because scipy.spatial takes longer to 
 both are exact to rounding near 0 and near pi too.
 """
 
-from typing import Any
-
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[Any]
+from snakesfm.arrays import Array
+
 IDENTITY = np.eye(3)
 GENERATORS = np.array(
     [[0, 0, 0, 0, 0, -1, 0, 1, 0], [0, 0, 1, 0, 0, 0, -1, 0, 0], [0, -1, 0, 1, 0, 0, 0, 0, 0]],

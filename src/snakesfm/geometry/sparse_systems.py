@@ -3,9 +3,8 @@
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[Any]
+from snakesfm.arrays import Array
 
 FACTORED_UNKNOWNS = 5000
 """Unknowns up to which a graph's factor costs less than a second; its cost grows faster than the graph."""

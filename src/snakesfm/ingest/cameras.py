@@ -6,16 +6,15 @@ from collections import Counter, defaultdict
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
 from pathlib import PurePosixPath
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from snakesfm.arrays import Array
 from snakesfm.geometry.camera import Camera
 from snakesfm.geometry.colmap_binding import pycolmap
 from snakesfm.ingest.exif import Exif, focal_from_exif, is_cropped, is_of_stated_size
 
-Array = NDArray[Any]
 Sharing = Literal["auto", "exif", "single", "per_folder", "per_image"]
 Series = tuple[str, str, str, str]
 

@@ -15,7 +15,6 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from PIL import (
     BmpImagePlugin,  # noqa: F401 - naming the plugins spares PIL the import of its fifty others
     ExifTags,
@@ -28,10 +27,9 @@ from PIL import (
     WebPImagePlugin,  # noqa: F401
 )
 
+from snakesfm.arrays import Array
 from snakesfm.errors import ImageError
 from snakesfm.ingest.exif import Exif, read_exif
-
-Array = NDArray[Any]
 
 # a JPEG that holds several pictures is opened as JPEG and then calls itself MPO
 FORMATS = ("JPEG", "PNG", "TIFF", "WEBP", "BMP")

@@ -4,11 +4,9 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from snakesfm.arrays import Array
 from snakesfm.learned.device import choose_device, load_torch
-
-Array = NDArray[Any]
 
 
 def to_tensor(images: Sequence[Array]) -> Any:

@@ -1,15 +1,12 @@
 """Mutual nearest neighbours with the ratio test, searched only among descriptors of similar words."""
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from snakesfm.arrays import Array
 from snakesfm.grouping import offsets_of
 from snakesfm.matching.nearest import accept, augmented, no_matches, pop_two_largest
-
-Array = NDArray[Any]
 
 # fewer descriptors per word and the loop over the words costs more than the products it saves
 MIN_PER_WORD = 64

@@ -5,11 +5,9 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from snakesfm.arrays import Array
 from snakesfm.lazy_loading import lazy
-
-Array = NDArray[Any]
 
 
 @dataclass(frozen=True)

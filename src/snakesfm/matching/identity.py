@@ -1,14 +1,10 @@
 """Matching by equal descriptors: the matcher of the oracle ``virtual``."""
 
-from typing import Any
-
 import numpy as np
-from numpy.typing import NDArray
 
+from snakesfm.arrays import Array
 from snakesfm.features.keypoints import KeypointSet
 from snakesfm.matching.nearest import no_matches
-
-Array = NDArray[Any]
 
 
 class IdentityMatcher:

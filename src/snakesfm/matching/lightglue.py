@@ -4,15 +4,13 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from snakesfm.arrays import Array
 from snakesfm.errors import ConfigError
 from snakesfm.features.keypoints import KeypointSet
 from snakesfm.learned.checkpoints import fill_network
 from snakesfm.learned.device import choose_device, load_torch
 from snakesfm.matching.nearest import no_matches
-
-Array = NDArray[Any]
 
 # what a network must know of the descriptors that it was trained on
 NETWORKS: dict[str, dict[str, Any]] = {

@@ -6,16 +6,14 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from snakesfm.arrays import Array
 from snakesfm.geometry.detector_sides import LEAST_SIDE_PX
 from snakesfm.learned.batches import equal_rows
 from snakesfm.learned.checkpoints import fill_network
 from snakesfm.learned.device import load_torch
 from snakesfm.learned.pictures import to_array, to_tensor
 from snakesfm.matching.detector_free import Picture, no_coordinates
-
-Array = NDArray[Any]
 
 
 @dataclass(frozen=True)

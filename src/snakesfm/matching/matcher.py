@@ -4,15 +4,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, Protocol, runtime_checkable
 
-from numpy.typing import NDArray
-
+from snakesfm.arrays import Array
 from snakesfm.features.keypoints import KeypointSet
 from snakesfm.lazy_loading import lazy
 from snakesfm.matching.clustered import ClusteredSearch
 from snakesfm.matching.identity import IdentityMatcher
 from snakesfm.matching.nearest import ExactSearch
-
-Array = NDArray[Any]
 
 
 class Matcher(Protocol):

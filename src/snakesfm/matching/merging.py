@@ -6,14 +6,10 @@ are therefore merged over all its pairs, and the pairs are then expressed in the
 (Sarlin et al. 2019) does the like on a grid.
 """
 
-from typing import Any
-
 import numpy as np
-from numpy.typing import NDArray
 
+from snakesfm.arrays import Array
 from snakesfm.grouping import one_to_one
-
-Array = NDArray[Any]
 
 
 def merge_coordinates(coordinates: Array, scores: Array, radius_px: float) -> tuple[Array, Array]:

@@ -1,12 +1,10 @@
 """Mutual nearest neighbours with the ratio test, as one blocked matrix product."""
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[Any]
+from snakesfm.arrays import Array
 
 # a block of products then stays in the processor's second and third cache
 ROWS_AT_ONCE = 256

@@ -4,8 +4,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from snakesfm.arrays import Array
 from snakesfm.errors import ConfigError
 from snakesfm.features.keypoints import KeypointSet
 from snakesfm.learned.batches import equal_rows
@@ -13,7 +13,6 @@ from snakesfm.learned.checkpoints import fill_network
 from snakesfm.learned.device import choose_device, load_torch
 from snakesfm.matching.nearest import no_matches
 
-Array = NDArray[Any]
 # places (N,2), descriptors (N,D) and scores (N,) of an image, float32
 Prepared = tuple[Array, Array, Array]
 

@@ -3,14 +3,12 @@
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from snakesfm.arrays import Array
 from snakesfm.features.virtual import VirtualKeypoints
 from snakesfm.geometry.colmap_binding import pycolmap
 from snakesfm.matching.detector_free import Picture, no_coordinates
 from snakesfm.seeding import derive_seed
-
-Array = NDArray[Any]
 
 
 class VirtualPlaces:

@@ -3,15 +3,13 @@
 import base64
 import html
 from collections.abc import Sequence
-from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from snakesfm.arrays import Array
 from snakesfm.geometry.poses import center_of
 
-Array = NDArray[Any]
 MAP_PX = 560
 MARGIN = 0.05
 HISTOGRAM_SIZE = (560, 180)

@@ -1,12 +1,10 @@
 """Per image: what each stage kept of it, and why an image has no pose."""
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[Any]
+from snakesfm.arrays import Array
 
 
 @dataclass(frozen=True)

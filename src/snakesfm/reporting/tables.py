@@ -5,11 +5,10 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from snakesfm.arrays import Array
 from snakesfm.reporting.registration import ImageCounts
 
-Array = NDArray[Any]
 IMAGE_HEADS = ["image", "registered", "pairs", "accepted", "kept edges", "observations", "mean error px"]
 ROUND_HEADS = [
     "round",

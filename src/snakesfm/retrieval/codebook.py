@@ -1,13 +1,9 @@
 """A codebook of local descriptors, learned by k-means on the scene itself."""
 
-from typing import Any
-
 import numpy as np
-from numpy.typing import NDArray
 
+from snakesfm.arrays import Array
 from snakesfm.grouping import offsets_of
-
-Array = NDArray[Any]
 
 ROWS_AT_ONCE = 4096
 

@@ -4,15 +4,13 @@ from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from snakesfm.arrays import Array
 from snakesfm.lazy_loading import lazy
 from snakesfm.learned.batches import equal_rows
 from snakesfm.learned.device import load_torch
 from snakesfm.learned.pictures import to_array, to_tensor
 from snakesfm.retrieval.rounding import round_units
-
-Array = NDArray[Any]
 
 
 class GlobalDescriptor(Protocol):

@@ -8,14 +8,11 @@ nearest neighbours counts by how much nearer it is than the second nearest.
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from snakesfm.arrays import Array
 from snakesfm.matching.nearest import augmented, pop_two_largest
-
-Array = NDArray[Any]
 
 FEWEST_KEYPOINTS = 50
 """Keypoints by which images with few of them are previewed."""

@@ -1,11 +1,8 @@
 """Global descriptors whose similarities do not depend on how a product of matrices sums them."""
 
-from typing import Any
-
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[Any]
+from snakesfm.arrays import Array
 
 STEPS = 2048.0
 

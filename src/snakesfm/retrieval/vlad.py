@@ -1,14 +1,10 @@
 """VLAD: one vector per image from its local descriptors (Jegou et al. 2010)."""
 
-from typing import Any
-
 import numpy as np
-from numpy.typing import NDArray
 
+from snakesfm.arrays import Array
 from snakesfm.retrieval.codebook import nearest_words, sum_by_word
 from snakesfm.retrieval.rounding import round_units
-
-Array = NDArray[Any]
 
 
 def describe_vlad(descriptors: Array, centers: Array, power: float) -> Array:

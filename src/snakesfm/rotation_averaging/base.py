@@ -2,16 +2,13 @@
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from snakesfm.arrays import Array
 from snakesfm.errors import SceneError
 from snakesfm.geometry.rotations import angle_of
 from snakesfm.view_graph.components import label_components
-
-Array = NDArray[Any]
 
 
 @dataclass(frozen=True)

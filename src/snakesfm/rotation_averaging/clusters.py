@@ -1,15 +1,11 @@
 """Clusters of images connected by cycles, and the votes by which they are joined."""
 
-from typing import Any
-
 import numpy as np
-from numpy.typing import NDArray
 
+from snakesfm.arrays import Array
 from snakesfm.geometry.rotations import angle_of
 from snakesfm.rotation_averaging.irls import IrlsAverager
 from snakesfm.view_graph.components import label_components
-
-Array = NDArray[Any]
 
 VOTES_AT_ONCE = 1000
 """Votes that are compared with all others of their two clusters at once."""

@@ -1,16 +1,13 @@
 """Robust averaging by iteratively reweighted least squares on the tangent spaces."""
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from snakesfm.arrays import Array
 from snakesfm.rotation_averaging.base import RotationAverager, RotationGraph
 from snakesfm.rotation_averaging.linear import apply_increments, solve_isotropic, world_residuals
 from snakesfm.rotation_averaging.tree import tree_rotations
-
-Array = NDArray[Any]
 
 SMALLEST_RAD = np.radians(0.01)
 """Residuals below this have the same weight in the L1 steps, which would be unbounded otherwise."""

@@ -3,13 +3,11 @@
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from snakesfm.arrays import Array
 from snakesfm.geometry.rotations import exp_so3, log_so3
 from snakesfm.geometry.sparse_systems import solve_spd
 from snakesfm.grouping import sum_by
-
-Array = NDArray[Any]
 
 DIRECT_DEGREE = 30
 """Mean degree up to which the sparse factor is small; denser graphs converge fast without one."""

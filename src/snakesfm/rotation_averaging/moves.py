@@ -1,17 +1,15 @@
 """Leaving local minima: descent in turns with moves of single nodes and of weakly connected groups."""
 
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from snakesfm.arrays import Array
 from snakesfm.rotation_averaging.base import RotationGraph, edge_residuals
 from snakesfm.rotation_averaging.irls import IrlsAverager
 from snakesfm.rotation_averaging.regroup import regroup_nodes
 from snakesfm.rotation_averaging.reseat import reseat_nodes
 
-Array = NDArray[Any]
 Move = Callable[[RotationGraph, Array, float], Array]
 
 MOVES = 3

@@ -1,12 +1,10 @@
 """A noise model of the relative rotations of a graph, fitted to their residuals."""
 
 import itertools
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[Any]
+from snakesfm.arrays import Array
 
 DEGREES_OF_FREEDOM = 4.0
 """Of the Student t distribution of the residuals."""

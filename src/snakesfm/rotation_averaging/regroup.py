@@ -1,15 +1,11 @@
 """Re-joining of groups of rotations that are connected by single edges, by a vote of all edges."""
 
-from typing import Any
-
 import numpy as np
-from numpy.typing import NDArray
 
+from snakesfm.arrays import Array
 from snakesfm.rotation_averaging.base import RotationGraph, edge_residuals
 from snakesfm.rotation_averaging.clusters import join_clusters
 from snakesfm.view_graph.bridges import find_bridges
-
-Array = NDArray[Any]
 
 
 def regroup_nodes(graph: RotationGraph, averaged: Array, tolerance_rad: float) -> Array:

@@ -1,13 +1,9 @@
 """Rejection of edges that do not fit the averaged rotations."""
 
-from typing import Any
-
 import numpy as np
-from numpy.typing import NDArray
 
+from snakesfm.arrays import Array
 from snakesfm.rotation_averaging.base import RotationGraph, edge_residuals
-
-Array = NDArray[Any]
 
 SIGMAS = 5.0
 RAYLEIGH3_MEDIAN = 1.5382

@@ -1,13 +1,9 @@
 """Single rotations that most of their edges contradict, moved to where more edges agree."""
 
-from typing import Any
-
 import numpy as np
-from numpy.typing import NDArray
 
+from snakesfm.arrays import Array
 from snakesfm.rotation_averaging.base import RotationGraph
-
-Array = NDArray[Any]
 
 CHUNK = 1 << 20
 """Candidate and edge combinations that are held in memory at once."""

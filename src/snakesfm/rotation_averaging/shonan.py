@@ -4,13 +4,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from snakesfm.arrays import Array
 from snakesfm.rotation_averaging.base import RotationAverager, RotationGraph
 from snakesfm.rotation_averaging.irls import IrlsAverager
 from snakesfm.rotation_averaging.tree import tree_rotations
-
-Array = NDArray[Any]
 
 
 @dataclass(frozen=True)

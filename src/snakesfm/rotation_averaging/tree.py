@@ -1,11 +1,8 @@
 """Rotations along a spanning tree: the start of the iterative averagers."""
 
-from typing import Any
-
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[Any]
+from snakesfm.arrays import Array
 
 
 def tree_rotations(node_count: int, pairs: Array, rotations: Array, costs: Array) -> Array:

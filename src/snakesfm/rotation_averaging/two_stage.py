@@ -2,11 +2,10 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from snakesfm.arrays import Array
 from snakesfm.geometry.rotations import log_so3
 from snakesfm.rotation_averaging.base import RotationAverager, RotationGraph
 from snakesfm.rotation_averaging.irls import IrlsAverager
@@ -17,8 +16,6 @@ from snakesfm.rotation_averaging.rejection import contradiction, residual_limit
 from snakesfm.rotation_averaging.tree import tree_rotations
 from snakesfm.view_graph.cycles import find_cycles
 from snakesfm.view_graph.messages import edge_errors
-
-Array = NDArray[Any]
 
 REFUSED = 1e-6
 """Weight of refused edges: none in effect, but the graph stays connected."""

@@ -1,19 +1,16 @@
 """Averaging of a filtered view graph; all edges, refused ones included, are then tested again."""
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from snakesfm.arrays import Array
 from snakesfm.rotation_averaging.base import RotationAverager, RotationGraph, edge_residuals
 from snakesfm.rotation_averaging.irls import IrlsAverager
 from snakesfm.rotation_averaging.moves import SEARCH_DEGREE, improve_rotations
 from snakesfm.rotation_averaging.rejection import residual_limit
 from snakesfm.view_graph.components import label_components
 from snakesfm.view_graph.filters import keep_largest_component
-
-Array = NDArray[Any]
 
 
 def average_components(

@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from snakesfm.artifacts.base import Array
+from snakesfm.arrays import Array
 from snakesfm.artifacts.images import CalibratedCameras, ImageIndex
 from snakesfm.artifacts.mapping import CameraCenters, CameraRotations, TrackTable
 from snakesfm.artifacts.pairs import KINDS, ViewGraph

@@ -2,11 +2,11 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from snakesfm.arrays import Array
 from snakesfm.artifacts.gather import gather_image_columns, gather_inlier_matches
 from snakesfm.artifacts.images import ImageIndex
 from snakesfm.artifacts.mapping import CameraRotations, TrackTable
@@ -20,8 +20,6 @@ from snakesfm.tracks.merged import compare_track_lengths, describe_lengths
 
 if TYPE_CHECKING:
     from snakesfm.config.build_tracks import BuildTracksOptions
-
-Array = NDArray[Any]
 
 
 def run(job: StageJob) -> None:

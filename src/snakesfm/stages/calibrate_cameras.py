@@ -3,11 +3,11 @@
 from collections.abc import Iterable, Iterator, Mapping
 from itertools import groupby
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from snakesfm.arrays import Array
 from snakesfm.artifacts.gather import gather_keypoints
 from snakesfm.artifacts.images import CalibratedCameras, ImageIndex
 from snakesfm.artifacts.pairs import PairMatches
@@ -25,7 +25,6 @@ from snakesfm.stages.job import StageJob
 if TYPE_CHECKING:
     from snakesfm.config.calibrate_cameras import CalibrateCamerasOptions
 
-Array = NDArray[Any]
 GIVEN_SIGMA = 0.0
 # more pairs show no other overlay, and cost time
 OVERLAY_PAIRS = 3000

@@ -2,11 +2,11 @@
 
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from snakesfm.arrays import Array
 from snakesfm.artifacts.features import GlobalDescriptors, LocalFeatures, Vocabulary
 from snakesfm.artifacts.images import ImageIndex
 from snakesfm.errors import ImageError
@@ -18,8 +18,6 @@ from snakesfm.stages.job import StageJob
 
 if TYPE_CHECKING:
     from snakesfm.config.describe_images import DescribeImagesOptions
-
-Array = NDArray[Any]
 
 
 def run(job: StageJob) -> None:

@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from snakesfm.arrays import Array
 from snakesfm.artifacts.gather import gather_keypoints
 from snakesfm.artifacts.images import CalibratedCameras, ImageIndex
 from snakesfm.artifacts.pairs import KINDS, REJECTIONS, PairMatches, TwoViewGeometries
@@ -29,7 +29,6 @@ from snakesfm.two_view.estimate import TwoViewEstimate, estimate_two_view_geomet
 if TYPE_CHECKING:
     from snakesfm.config.estimate_two_view import EstimateTwoViewOptions
 
-Array = NDArray[Any]
 Row = dict[str, Any]
 
 

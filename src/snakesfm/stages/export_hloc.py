@@ -1,12 +1,12 @@
 """export_hloc: features, matches and the list of pairs in the files of hloc."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import h5py
 import numpy as np
-from numpy.typing import NDArray
 
+from snakesfm.arrays import Array
 from snakesfm.artifacts import ImageIndex, LocalFeatures, PairMatches, TwoViewGeometries, atomic_path
 from snakesfm.artifacts.hloc import clashing_names, write_hloc_features, write_hloc_matches
 from snakesfm.errors import ConfigError
@@ -14,8 +14,6 @@ from snakesfm.stages.job import StageJob
 
 if TYPE_CHECKING:
     from snakesfm.config.export_hloc import ExportHlocOptions
-
-Array = NDArray[Any]
 
 SPACES = (
     "Some image names contain spaces, at which hloc splits the lines of pairs.txt, so it cannot read this "

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from snakesfm.arrays import Array
 from snakesfm.artifacts.features import LocalFeatures
 from snakesfm.artifacts.hloc import (
     descriptor_size,
@@ -30,8 +30,6 @@ from snakesfm.stages.job import StageJob
 
 if TYPE_CHECKING:
     from snakesfm.config.extract_features import ExtractFeaturesOptions
-
-Array = NDArray[Any]
 
 
 @dataclass(frozen=True)

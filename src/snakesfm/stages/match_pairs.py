@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from snakesfm.arrays import Array
 from snakesfm.artifacts.features import LocalFeatures
 from snakesfm.artifacts.hloc import open_hloc, read_hloc_matches
 from snakesfm.artifacts.images import ImageIndex
@@ -35,7 +35,6 @@ from snakesfm.stages.job import StageJob
 if TYPE_CHECKING:
     from snakesfm.config.match_pairs import MatchPairsOptions
 
-Array = NDArray[Any]
 Matches = tuple[Array, Array]
 
 

@@ -3,11 +3,11 @@
 import hashlib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from snakesfm.arrays import Array
 from snakesfm.artifacts.features import LocalFeatures
 from snakesfm.artifacts.images import ImageIndex
 from snakesfm.artifacts.pairs import PairCoordinates
@@ -20,8 +20,6 @@ from snakesfm.stages.job import StageJob
 
 if TYPE_CHECKING:
     from snakesfm.config.merge_keypoints import MergeKeypointsOptions
-
-Array = NDArray[Any]
 
 # colours need no more pixels than this
 COLOR_SIDE_PX = 760

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 import snakesfm
+from snakesfm.arrays import Array
 from snakesfm.artifacts import (
     CameraRotations,
     ImageIndex,
@@ -21,7 +22,6 @@ from snakesfm.artifacts import (
     atomic_path,
     read_header,
 )
-from snakesfm.artifacts.base import Array
 from snakesfm.artifacts.pairs import EDGE_LABELS, KINDS, REJECTIONS
 from snakesfm.geometry.camera import cameras_from_columns, observation_errors
 from snakesfm.job_logs import stage_costs

@@ -2,11 +2,11 @@
 
 import itertools
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from snakesfm.arrays import Array
 from snakesfm.artifacts.features import GlobalDescriptors, LocalFeatures
 from snakesfm.artifacts.hloc import open_hloc, read_hloc_pairs
 from snakesfm.artifacts.images import ImageIndex
@@ -27,8 +27,6 @@ from snakesfm.stages.job import StageJob
 
 if TYPE_CHECKING:
     from snakesfm.config.select_pairs import SelectPairsOptions
-
-Array = NDArray[Any]
 
 # how many pairs are previewed between two progress messages: about a second
 LOOKS_AT_ONCE = 2_000

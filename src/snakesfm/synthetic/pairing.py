@@ -1,15 +1,12 @@
 """Which image pairs of a survey are matched, and the relative poses that would be estimated."""
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from snakesfm.arrays import Array
 from snakesfm.geometry.rotations import exp_so3
 from snakesfm.synthetic.surveys import LANDMARKS_PER_CELL, Survey
-
-Array = NDArray[Any]
 
 STRANGERS = 8
 MIN_INLIERS = 15

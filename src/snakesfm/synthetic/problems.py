@@ -6,18 +6,17 @@ is a bounded set of neighbouring cameras that see one point. Neighbours are abou
 
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from snakesfm.arrays import Array
 from snakesfm.geometry.camera import Camera
 from snakesfm.geometry.poses import translation_of
 from snakesfm.geometry.rotations import exp_so3
 from snakesfm.grouping import offsets_of
 from snakesfm.synthetic.layouts import LAYOUTS
 
-Array = NDArray[Any]
 Layout = Literal["ring", "street", "area", "facade"]
 
 DEFAULT_CAMERA = Camera("PINHOLE", 640, 480, (500.0, 500.0, 320.0, 240.0))

@@ -3,15 +3,13 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from snakesfm.arrays import Array
 from snakesfm.geometry.camera import Camera
 
-Array = NDArray[Any]
 NEAR = 0.05
 MAX_LEVEL = 6
 REMAP_WIDTH = 1024

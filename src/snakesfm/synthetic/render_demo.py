@@ -12,12 +12,11 @@ import sys
 import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from snakesfm.arrays import Array
 from snakesfm.errors import ConfigError, SnakesfmError
 from snakesfm.export.colmap import build_reconstruction
 from snakesfm.geometry.camera import Camera
@@ -25,7 +24,6 @@ from snakesfm.seeding import derive_seed
 from snakesfm.synthetic.raster import Face, View, render
 from snakesfm.synthetic.scene import DemoOptions, build_scene, camera_path, sample_points, sky
 
-Array = NDArray[Any]
 VERSION = 1
 MARKER = "demo.json"
 SAMPLES = 2

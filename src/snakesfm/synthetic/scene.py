@@ -6,8 +6,8 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from snakesfm.arrays import Array
 from snakesfm.geometry.camera import Camera
 from snakesfm.geometry.poses import translation_of
 from snakesfm.geometry.rotations import exp_so3
@@ -15,7 +15,6 @@ from snakesfm.seeding import derive_seed
 from snakesfm.synthetic import textures
 from snakesfm.synthetic.raster import Face, Texture, View
 
-Array = NDArray[Any]
 SUN = np.array([-0.45, 0.55, -0.70]) / np.linalg.norm([-0.45, 0.55, -0.70])
 AMBIENT = 0.62
 TEXELS_PER_METRE = 110

@@ -5,12 +5,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from snakesfm.arrays import Array
 from snakesfm.features.keypoints import KeypointSet
 from snakesfm.synthetic.surveys import Survey
-
-Array = NDArray[Any]
 
 DESCRIPTOR_SIZE = 128
 DESCRIPTOR_NORM = 512.0

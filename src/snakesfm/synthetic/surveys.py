@@ -7,15 +7,13 @@ seed and the cell's place alone.
 import functools
 from collections.abc import Callable
 from dataclasses import dataclass, fields
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from snakesfm.arrays import Array
 from snakesfm.geometry.camera import Camera
 from snakesfm.synthetic.layouts import look_at, wobble
-
-Array = NDArray[Any]
 
 Cell = tuple[int, int, int]
 CELLS_KEPT = 2048

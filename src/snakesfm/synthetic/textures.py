@@ -1,12 +1,10 @@
 """Procedural textures: images full of distinct detail that no two surfaces share."""
 
-from typing import Any
-
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[Any]
+from snakesfm.arrays import Array
+
 Color = tuple[float, float, float]
 
 

@@ -1,15 +1,12 @@
 """Disjoint sets over inlier matches."""
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from snakesfm.arrays import Array
 from snakesfm.grouping import components_of, offsets_of
 from snakesfm.tracks.split import cycle_support, split_conflicts, unconfirmed_links
-
-Array = NDArray[Any]
 
 
 @dataclass(frozen=True)

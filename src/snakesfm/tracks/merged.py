@@ -1,15 +1,12 @@
 """Track lengths before and after merging the keypoints of a detector-free matcher."""
 
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from snakesfm.arrays import Array
 from snakesfm.grouping import components_of
 from snakesfm.matching.merging import MergedKeypoints
-
-Array = NDArray[Any]
 
 
 def compare_track_lengths(

@@ -1,13 +1,9 @@
 """Splitting of components at unconfirmed links, and where they contain two points of one image."""
 
-from typing import Any
-
 import numpy as np
-from numpy.typing import NDArray
 
+from snakesfm.arrays import Array
 from snakesfm.grouping import components_of
-
-Array = NDArray[Any]
 
 ROWS_AT_ONCE = 200_000
 

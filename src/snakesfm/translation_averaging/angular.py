@@ -1,17 +1,14 @@
 """Bundle adjustment of centres and landmarks with known rotations, on the angles of the rays."""
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from snakesfm.arrays import Array
 from snakesfm.geometry.sparse_systems import solve_spd
 from snakesfm.grouping import sum_by
 from snakesfm.translation_averaging.landmarks import intersect, perpendicular
 from snakesfm.translation_averaging.problem import PositioningProblem
-
-Array = NDArray[Any]
 
 FACTORED_UNKNOWNS = 900
 """Unknowns up to which the reduced system, which is denser than a graph's, is factored."""

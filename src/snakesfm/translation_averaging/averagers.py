@@ -2,17 +2,15 @@
 
 import math
 from dataclasses import dataclass
-from typing import Any, Literal, Protocol
+from typing import Literal, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from snakesfm.arrays import Array
 from snakesfm.translation_averaging.landmarks import cover_cameras, edge_angles_rad
 from snakesfm.translation_averaging.problem import PositioningProblem
 from snakesfm.translation_averaging.scale_chain import chain_centers
 from snakesfm.view_graph.components import label_components
-
-Array = NDArray[Any]
 
 LARGEST_SCALE_GAP = 10.0
 LEAST_SHARE_AT_ONE_SCALE = 0.9

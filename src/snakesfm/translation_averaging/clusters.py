@@ -8,15 +8,12 @@ shift, which a loop of edges tells.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from snakesfm.arrays import Array
 from snakesfm.translation_averaging.landmarks import edge_angles_rad, perpendicular, usual_error_rad
 from snakesfm.translation_averaging.problem import PositioningProblem
-
-Array = NDArray[Any]
 
 # edges are no better than this, and no better than those of the first cluster agree with its centres
 LEAST_SIGMA_RAD = math.radians(0.3)

@@ -1,14 +1,10 @@
 """Landmarks of known cameras: which tracks to use, and where the landmarks are."""
 
-from typing import Any
-
 import numpy as np
-from numpy.typing import NDArray
 
+from snakesfm.arrays import Array
 from snakesfm.grouping import sum_by
 from snakesfm.translation_averaging.problem import PositioningProblem
-
-Array = NDArray[Any]
 
 
 def cover_cameras(ray_images: Array, ray_tracks: Array, image_count: int, rays_per_camera: int) -> Array:

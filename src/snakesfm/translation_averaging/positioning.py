@@ -1,16 +1,13 @@
 """pycolmap's global positioning."""
 
-from typing import Any
-
 import numpy as np
-from numpy.typing import NDArray
 
+from snakesfm.arrays import Array
 from snakesfm.geometry.colmap_binding import pycolmap
 from snakesfm.grouping import sum_by
 from snakesfm.translation_averaging.landmarks import intersect
 from snakesfm.translation_averaging.problem import PositioningProblem
 
-Array = NDArray[Any]
 FOCAL_PX = 1000.0
 
 

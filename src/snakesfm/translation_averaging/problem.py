@@ -1,12 +1,10 @@
 """The input of translation averagers."""
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[Any]
+from snakesfm.arrays import Array
 
 
 @dataclass(frozen=True)

@@ -4,11 +4,9 @@ from typing import Any
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
+from snakesfm.arrays import Array
 from snakesfm.translation_averaging.problem import PositioningProblem
-
-Array = NDArray[Any]
 
 
 def recover_translations(problem: PositioningProblem, sigma: float, huber: float, seed: int) -> Array:

@@ -6,17 +6,15 @@ landmark so compare their baselines. Nothing is drawn at random and nothing is n
 """
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from snakesfm.arrays import Array
 from snakesfm.geometry.sparse_systems import solve_spd
 from snakesfm.grouping import components_of, offsets_of, sum_by
 from snakesfm.translation_averaging.clusters import join_clusters
 from snakesfm.translation_averaging.problem import PositioningProblem
 
-Array = NDArray[Any]
 FIRST_SCALE = 16.0
 IRLS_ROUNDS = 12
 IRLS_TOLERANCE = 5e-3

@@ -2,11 +2,10 @@
 
 import math
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from snakesfm.arrays import Array
 from snakesfm.grouping import sum_by
 from snakesfm.translation_averaging.landmarks import (
     angles_rad,
@@ -16,8 +15,6 @@ from snakesfm.translation_averaging.landmarks import (
     usual_error_rad,
 )
 from snakesfm.translation_averaging.problem import PositioningProblem
-
-Array = NDArray[Any]
 
 TELLING_SIGHTS = 3
 RAY_SIGMAS = 4.0

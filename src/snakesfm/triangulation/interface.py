@@ -1,14 +1,12 @@
 """The interface of triangulators."""
 
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from snakesfm.arrays import Array
 from snakesfm.geometry.poses import to_camera
-
-Array = NDArray[Any]
 
 
 @dataclass(frozen=True)

@@ -1,16 +1,13 @@
 """pycolmap's robust triangulation, one track at a time."""
 
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from snakesfm.arrays import Array
 from snakesfm.geometry.colmap_binding import pycolmap
 from snakesfm.geometry.poses import to_rigid3d
 from snakesfm.triangulation.interface import TriangulationLimits, TriangulationProblem, check_points
-
-Array = NDArray[Any]
 
 
 def triangulate_pycolmap(problem: TriangulationProblem, limits: TriangulationLimits) -> tuple[Array, Array]:

@@ -1,14 +1,10 @@
 """RANSAC over pairs of observations, batched over tracks of one length."""
 
-from typing import Any
-
 import numpy as np
-from numpy.typing import NDArray
 
+from snakesfm.arrays import Array
 from snakesfm.grouping import offsets_of
 from snakesfm.triangulation.interface import TriangulationLimits, TriangulationProblem, check_points
-
-Array = NDArray[Any]
 
 BATCH_VALUES = 4_000_000
 REFINEMENTS = 4

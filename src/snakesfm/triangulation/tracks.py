@@ -1,16 +1,15 @@
 """Triangulation of all tracks of a scene, with a triangulator by name."""
 
 from collections.abc import Sequence
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from snakesfm.arrays import Array
 from snakesfm.geometry.camera import Camera, undistort
 from snakesfm.grouping import offsets_of
 from snakesfm.triangulation.interface import TriangulationLimits, TriangulationProblem, Triangulator
 
-Array = NDArray[Any]
 Method = Literal["ransac_dlt", "pycolmap"]
 
 

@@ -1,15 +1,11 @@
 """Two-view bundle adjustment with the points eliminated."""
 
-from typing import Any
-
 import numpy as np
-from numpy.typing import NDArray
 
+from snakesfm.arrays import Array
 from snakesfm.geometry.rotations import GENERATORS
 from snakesfm.two_view.sampson import Correspondences, cauchy_cost, cauchy_weights, solve_damped
 from snakesfm.two_view.tangents import cross_matrix, perturb_pose, tangent_basis
-
-Array = NDArray[Any]
 
 
 def inverse_depths(points: Correspondences, rotation: Array, translation: Array) -> Array:

@@ -1,15 +1,11 @@
 """From matched keypoints to correspondences: duplicates, rays, and one match per position."""
 
-from typing import Any
-
 import numpy as np
-from numpy.typing import NDArray
 
+from snakesfm.arrays import Array
 from snakesfm.geometry.camera import Camera
 from snakesfm.grouping import one_to_one
 from snakesfm.two_view.sampson import Correspondences
-
-Array = NDArray[Any]
 
 
 def first_rows_at_place(keypoints: Array) -> Array:

@@ -1,11 +1,9 @@
 """Covariance of a refined relative pose from the derivatives of its residuals."""
 
-from typing import Any
-
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[Any]
+from snakesfm.arrays import Array
+
 DIRECTION_UNKNOWN_VARIANCE = float(np.pi**2 / 3.0)
 
 

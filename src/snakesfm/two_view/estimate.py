@@ -1,11 +1,11 @@
 """The two-view geometry of one pair of images."""
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from snakesfm.arrays import Array
 from snakesfm.geometry.camera import Camera
 from snakesfm.geometry.rotations import angle_between
 from snakesfm.two_view.bundle import inverse_depths
@@ -20,7 +20,6 @@ from snakesfm.two_view.significance import significance_of
 if TYPE_CHECKING:
     from snakesfm.config.estimate_two_view import EstimateTwoViewOptions
 
-Array = NDArray[Any]
 THRESHOLD_SIGMAS = 3.0
 SELECTION_SIGMAS = 4.0
 REACH_FACTOR = 4.0

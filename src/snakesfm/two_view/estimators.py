@@ -6,11 +6,10 @@ from typing import Any, Protocol
 import cv2
 import numpy as np
 import poselib
-from numpy.typing import NDArray
 
+from snakesfm.arrays import Array
 from snakesfm.two_view.sampson import Correspondences
 
-Array = NDArray[Any]
 MINIMAL_SAMPLE = 5
 CONFIDENCE = 0.9999
 

@@ -1,12 +1,10 @@
 """Degenerate cases: a planar scene, and a camera that only rotates."""
 
-from typing import Any
-
 import cv2
 import numpy as np
 import poselib
-from numpy.typing import NDArray
 
+from snakesfm.arrays import Array
 from snakesfm.geometry.robust import robust_sigma
 from snakesfm.geometry.rotations import GENERATORS, exp_so3
 from snakesfm.two_view.covariance import cauchy_variance, invert_information
@@ -15,8 +13,6 @@ from snakesfm.two_view.sampson import (
     cauchy_weights,
     solve_damped,
 )
-
-Array = NDArray[Any]
 
 
 def fit_homography(points: Correspondences, max_error_px: float, seed: int) -> tuple[Array, int]:

@@ -1,12 +1,12 @@
 """Refinement of a robustly estimated relative pose, with its covariance and its noise."""
 
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import poselib
-from numpy.typing import NDArray
 
+from snakesfm.arrays import Array
 from snakesfm.geometry.robust import robust_sigma
 from snakesfm.two_view.bundle import refine_bundle
 from snakesfm.two_view.covariance import pose_covariance
@@ -18,7 +18,6 @@ from snakesfm.two_view.sampson import (
     sampson_jacobian,
 )
 
-Array = NDArray[Any]
 Refinement = Literal["none", "sampson", "bundle"]
 SIGMA_FLOOR_PX = 0.03
 NEAR_SIGMAS = 6.0

@@ -1,15 +1,12 @@
 """The Sampson error in pixels, its derivatives, and robust refinement of a relative pose on it."""
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from snakesfm.arrays import Array
 from snakesfm.geometry.rotations import GENERATORS
 from snakesfm.two_view.tangents import cross_matrix, perturb_pose, tangent_basis
-
-Array = NDArray[Any]
 
 
 @dataclass(frozen=True)

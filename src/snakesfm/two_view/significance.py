@@ -1,11 +1,9 @@
 """Significance of a relative pose: how unlikely it is that as many matches agree with it by chance."""
 
-from typing import Any
-
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[Any]
+from snakesfm.arrays import Array
+
 LOG10 = float(np.log(10.0))
 
 

@@ -1,12 +1,9 @@
 """The five parameters of a relative pose: a left rotation increment and two tangents of the direction."""
 
-from typing import Any
-
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[Any]
+from snakesfm.arrays import Array
 
 
 def tangent_basis(translations: Array) -> Array:

@@ -1,13 +1,9 @@
 """Bridges of a view graph: edges that are the only connection between two parts."""
 
-from typing import Any
-
 import numpy as np
-from numpy.typing import NDArray
 
+from snakesfm.arrays import Array
 from snakesfm.grouping import components_of
-
-Array = NDArray[Any]
 
 
 def find_bridges(node_count: int, pairs: Array) -> Array:

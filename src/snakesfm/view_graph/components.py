@@ -1,13 +1,9 @@
 """Connected components of a view graph."""
 
-from typing import Any
-
 import numpy as np
-from numpy.typing import NDArray
 
+from snakesfm.arrays import Array
 from snakesfm.grouping import components_of
-
-Array = NDArray[Any]
 
 
 def label_components(node_count: int, pairs: Array) -> Array:

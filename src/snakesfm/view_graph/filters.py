@@ -1,15 +1,11 @@
 """Filters of a view graph: which edges are refused, and by what."""
 
-from typing import Any
-
 import numpy as np
-from numpy.typing import NDArray
 
+from snakesfm.arrays import Array
 from snakesfm.view_graph.components import label_components
 from snakesfm.view_graph.cycles import Cycles, median_of, smallest_of
 from snakesfm.view_graph.messages import edge_errors
-
-Array = NDArray[Any]
 
 
 def refuse_by_cycles(

@@ -1,13 +1,9 @@
 """The error of each edge, from messages that its 3-cycles pass between their edges."""
 
-from typing import Any
-
 import numpy as np
-from numpy.typing import NDArray
 
+from snakesfm.arrays import Array
 from snakesfm.view_graph.cycles import Cycles
-
-Array = NDArray[Any]
 
 SHARPNESS = (0.0, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0, 64.0)
 """Per round, how fast a cycle loses its say with the errors (in half turns) of its two other edges."""

@@ -1,7 +1,6 @@
 """Focal lengths from matched pairs."""
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -25,7 +24,6 @@ from snakesfm.geometry.camera import Camera
 from snakesfm.geometry.rotations import exp_so3
 from snakesfm.two_view.sampson import cauchy_cost, sampson_errors_px
 
-Array = np.ndarray[Any, Any]
 OPTIONS = CalibrateCamerasOptions()
 CENTER = np.array([500.0, 400.0])
 
