@@ -6,12 +6,12 @@ of ``a/b.jpg`` is ``a/b.jpg.png`` in the folder of masks, as in COLMAP; ``a/b.pn
 
 from collections.abc import Mapping
 from pathlib import Path, PurePosixPath
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from snakesfm.errors import ConfigError
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
+    from snakesfm.arrays import Array
 
 # a mask may have another size than its image, but must show the same
 MAX_ASPECT_DIFFERENCE = 0.01
@@ -37,7 +37,7 @@ def masks_as_large(folder: Path, sizes: Mapping[str, tuple[int, int]]) -> dict[s
     return found
 
 
-def read_mask(path: Path, size: tuple[int, int]) -> "NDArray[Any]":
+def read_mask(path: Path, size: tuple[int, int]) -> "Array":
     """Where keypoints are wanted, (H,W) bool, of an image of a width and height: where it is not black.
 
     A small number of an instance in 16 bits is not black. The mask may be larger or smaller than the image.
