@@ -1,0 +1,93 @@
+"""The README's figures are those of the measured results in docs/."""
+
+import re
+from pathlib import Path
+
+import pandas
+import pytest
+
+from benchmarks.compare.results import GLOBAL, INCREMENTAL, OURS, OWN
+
+ROOT = Path(__file__).resolve().parents[3]
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+METHODS = [OURS, INCREMENTAL, GLOBAL]
+SETS = {
+    "Vesta": "astrovision_vesta_4",
+    "Reichstag": "imc_reichstag_10",
+    "entry-P10": "strecha_entry_p10",
+    "fountain-P11": "strecha_fountain_p11",
+    "Lund door": "olsson_lund_door",
+    "castle-P19": "strecha_castle_p19",
+    "castle-P30": "strecha_castle_p30",
+    "temple ring": "middlebury_temple_ring",
+    "KITTI": "kitti_seq2_51",
+    "Statue of Liberty": "statue_of_liberty_135",
+    "Seneca": "seneca_aerial_167",
+    "7-Scenes": "sevenscenes_redkitchen_200",
+}
+
+
+def medians(page: str, image_set: str) -> pandas.DataFrame:
+    """Medians over the seeds of each method with its own front-end; runs without a model are 0."""
+    runs = pandas.read_csv(ROOT / "docs" / f"{page}.csv")
+    runs = runs[(runs.image_set == image_set) & (runs.setting == OWN)]
+    return runs.fillna({"registered_images": 0}).groupby("method").median(numeric_only=True)
+
+
+def row_of(start: str) -> list[str]:
+    """The cells of the only row that starts so."""
+    (row,) = [line for line in README.splitlines() if line.startswith(f"| {start}")]
+    return [cell.strip(" *") for cell in row.strip("|").split("|")]
+
+
+@pytest.mark.parametrize("name", list(SETS)[:9])
+def test_accuracy_and_time_with_surveyed_truth(name):
+    _, images, *figures = row_of(name)
+    measured = medians("benchmarks", SETS[name])
+    assert measured.images[OURS] == int(images)
+    for method, accuracy, seconds in zip(METHODS, figures[:3], figures[3:], strict=True):
+        if accuracy == "no model":
+            assert measured.registered_images[method] == 0
+            assert seconds == ""
+        else:
+            assert float(accuracy) == pytest.approx(measured.relative_pose_auc_1deg[method], abs=0.051)
+            assert float(seconds) == pytest.approx(measured.total_cpu_seconds[method], abs=0.51)
+
+
+def test_total_seconds_of_the_large_sets():
+    text = README.replace("\n", " ")
+    found = re.findall(r"\(([^()]+)\) (\d+) / (\d+) / (\d+)", text)
+    assert len(found) == 3
+    for name, *seconds in found:
+        measured = medians("benchmarks", SETS[name])
+        for method, shown in zip(METHODS, seconds, strict=True):
+            assert float(shown) == pytest.approx(measured.total_seconds[method], abs=0.51)
+
+
+def test_photographs_of_full_resolution():
+    methods = [*METHODS, "openmvg_global"]
+    measured = medians("benchmarks_large", "courtyard_4000")
+    for start, column, step in (
+        ("total seconds", "total_seconds", 1),
+        ("AUC@1 |", "relative_pose_auc_1deg", 0.01),
+    ):
+        for method, shown in zip(methods, row_of(start)[1:], strict=True):
+            assert float(shown) == pytest.approx(measured[column][method], abs=0.51 * step)
+
+
+@pytest.mark.parametrize(
+    ("label", "image_set"),
+    [
+        ("a quarter of castle-P30", "strecha_castle_p30_every_4"),
+        ("a quarter of the temple ring", "middlebury_temple_ring_every_4"),
+    ],
+)
+def test_photographs_that_overlap_little(label, image_set):
+    measured = medians("benchmarks_thinned", image_set)
+    for method, shown in zip(METHODS, row_of(label)[1:], strict=True):
+        images, areas = shown.split(", ")
+        assert int(images) == measured.registered_images[method]
+        for degrees, area in zip((1, 3, 5), areas.split("/"), strict=True):
+            assert float(area) == pytest.approx(
+                measured[f"relative_pose_auc_{degrees}deg"][method], abs=0.51
+            )
