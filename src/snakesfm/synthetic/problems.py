@@ -145,37 +145,25 @@ def make_problem(
     image_ids, point_ids, pixels = image_ids[keep], point_ids[keep], pixels[keep]
     seen, point_ids = np.unique(point_ids, return_inverse=True)
     order = np.lexsort((image_ids, point_ids))
-    image_ids, point_ids, pixels = image_ids[order], point_ids[order], pixels[order]
     points = scene.points[seen]
-
-    size = np.array([camera.width, camera.height], dtype=np.float64)
-    outliers = observing.random(len(image_ids)) < outlier_ratio
-    measured = pixels + observing.normal(0.0, 1.0, pixels.shape) * noise_px
-    measured = np.where(outliers[:, None], observing.random(pixels.shape) * size, measured)
-    measured = np.clip(measured, 0.0, size).astype(np.float32)
-
-    row_order = np.lexsort((observing.random(len(image_ids)), image_ids))
-    image_starts = np.searchsorted(image_ids[row_order], np.arange(camera_count + 1))
-    keypoint_ids = np.empty(len(image_ids), dtype=np.int32)
-    keypoint_ids[row_order] = np.arange(len(image_ids)) - image_starts[image_ids[row_order]]
-    shown = np.where(outliers, -1, point_ids)[row_order]
-    rows = measured[row_order]
-    spans = list(pairwise(image_starts))
+    observed = _observe(
+        image_ids[order],
+        point_ids[order],
+        pixels[order],
+        camera_count,
+        camera,
+        noise_px,
+        outlier_ratio,
+        observing,
+    )
 
     pairs, match_offsets, left, right = _shared_observations(
-        image_ids, point_ids, camera_count, len(points), min_shared
+        observed.image_ids, observed.point_ids, camera_count, len(points), min_shared
     )
     bad_edges = edging.random(len(pairs)) < pair_outlier_ratio
     edge_of_match = np.repeat(np.arange(len(pairs)), np.diff(match_offsets))
-    random_match = (matching.random(len(left)) < outlier_ratio) | bad_edges[edge_of_match]
-    matches = np.stack([keypoint_ids[left], keypoint_ids[right]], axis=1).astype(np.int32)
-    counts = np.diff(image_starts)
-    matches[random_match, 1] = (
-        matching.random(int(random_match.sum())) * counts[image_ids[right[random_match]]]
-    ).astype(np.int32)
-    false_match = random_match | outliers[left] | outliers[right]
+    matches, false_match = _match(observed, left, right, outlier_ratio, bad_edges[edge_of_match], matching)
     right_counts = np.bincount(edge_of_match[~false_match], minlength=len(pairs))
-    angles = _pair_angles_deg(points[point_ids[left]], scene.centers, pairs, edge_of_match)
 
     sigma = np.radians([rotation_noise_deg, 2.0 * rotation_noise_deg])
     if translation_noise_deg is not None:
@@ -193,23 +181,93 @@ def make_problem(
         translations=translation_of(scene.rotations, scene.centers),
         centers=scene.centers,
         points=points,
-        keypoints=tuple(rows[a:b] for a, b in spans),
-        keypoint_points=tuple(shown[a:b] for a, b in spans),
-        track_offsets=np.searchsorted(point_ids, np.arange(len(points) + 1)).astype(np.int64),
-        track_image_ids=image_ids.astype(np.int32),
-        track_keypoint_ids=keypoint_ids,
-        track_outliers=outliers,
+        keypoints=observed.keypoints,
+        keypoint_points=observed.keypoint_points,
+        track_offsets=np.searchsorted(observed.point_ids, np.arange(len(points) + 1)).astype(np.int64),
+        track_image_ids=observed.image_ids.astype(np.int32),
+        track_keypoint_ids=observed.keypoint_ids,
+        track_outliers=observed.outliers,
         pairs=pairs,
         edge_rotations=rotations,
         edge_translations=directions,
         edge_covariances=covariances,
         edge_inlier_counts=np.where(bad_edges, chance_counts, right_counts).astype(np.int32),
-        edge_angles_deg=angles,
+        edge_angles_deg=_pair_angles_deg(
+            points[observed.point_ids[left]], scene.centers, pairs, edge_of_match
+        ),
         edge_outliers=bad_edges,
         match_offsets=match_offsets,
         matches=matches,
         match_outliers=false_match,
     )
+
+
+@dataclass(frozen=True)
+class _Observations:
+    """Observations (L), sorted by point, then image, and the images' keypoints (N) that they are."""
+
+    image_ids: Array
+    point_ids: Array
+    keypoint_ids: Array
+    outliers: Array
+    keypoints: tuple[Array, ...]
+    keypoint_points: tuple[Array, ...]
+
+
+def _observe(
+    image_ids: Array,
+    point_ids: Array,
+    pixels: Array,
+    image_count: int,
+    camera: Camera,
+    noise_px: float,
+    outlier_ratio: float,
+    rng: np.random.Generator,
+) -> _Observations:
+    """Exact pixels (L,2) with noise and outliers, as each image's keypoints in random order."""
+    size = np.array([camera.width, camera.height], dtype=np.float64)
+    outliers = rng.random(len(image_ids)) < outlier_ratio
+    measured = pixels + rng.normal(0.0, 1.0, pixels.shape) * noise_px
+    measured = np.where(outliers[:, None], rng.random(pixels.shape) * size, measured)
+    measured = np.clip(measured, 0.0, size).astype(np.float32)
+
+    order = np.lexsort((rng.random(len(image_ids)), image_ids))
+    starts = np.searchsorted(image_ids[order], np.arange(image_count + 1))
+    keypoint_ids = np.empty(len(image_ids), dtype=np.int32)
+    keypoint_ids[order] = np.arange(len(image_ids)) - starts[image_ids[order]]
+    shown = np.where(outliers, -1, point_ids)
+    return _Observations(
+        image_ids,
+        point_ids,
+        keypoint_ids,
+        outliers,
+        keypoints=tuple(measured[order[a:b]] for a, b in pairwise(starts)),
+        keypoint_points=tuple(shown[order[a:b]] for a, b in pairwise(starts)),
+    )
+
+
+def _match(
+    observed: _Observations,
+    left: Array,
+    right: Array,
+    outlier_ratio: float,
+    unrelated: Array,
+    rng: np.random.Generator,
+) -> tuple[Array, Array]:
+    """Matches (M,2) of observations, some with any keypoint of the other image, and which (M,) are false.
+
+    Parameters
+    ----------
+    left, right : (M,) observations in image i and j of the points that a pair shares.
+    unrelated : (M,) bool, the match is of a pair that has random matches only.
+    """
+    random_match = (rng.random(len(left)) < outlier_ratio) | unrelated
+    matches = np.stack([observed.keypoint_ids[left], observed.keypoint_ids[right]], axis=1).astype(np.int32)
+    counts = np.array([len(keypoints) for keypoints in observed.keypoints])
+    matches[random_match, 1] = (
+        rng.random(int(random_match.sum())) * counts[observed.image_ids[right[random_match]]]
+    ).astype(np.int32)
+    return matches, random_match | observed.outliers[left] | observed.outliers[right]
 
 
 def _visible(
