@@ -8,6 +8,7 @@ import numpy as np
 from snakesfm.arrays import Array
 from snakesfm.artifacts.features import LocalFeatures
 from snakesfm.artifacts.pairs import REJECTIONS, TwoViewGeometries
+from snakesfm.errors import ArtifactError
 from snakesfm.grouping import offsets_of
 
 
@@ -43,24 +44,35 @@ def gather_image_columns(
 
 
 def gather_keypoints(
-    paths: Iterable[Path], images: Collection[int]
+    paths: Iterable[Path], images: Collection[int], names: Array
 ) -> tuple[dict[int, Array], dict[int, str]]:
-    """Keypoints (K,2) float32 and digests of some images, by row of the index, as far as files hold them.
+    """Keypoints (K,2) float32 and digests of matched images, by row of the index.
 
     Parameters
     ----------
-    paths : LocalFeatures files that may hold them.
+    paths : LocalFeatures files that hold them.
+    images : rows of the index.
+    names : (N,) str, the index's names of images.
+
+    Raises
+    ------
+    ArtifactError : no file holds one of the images.
     """
     keypoints: dict[int, Array] = {}
     digests: dict[int, str] = {}
     for path in paths:
         with LocalFeatures.open(path) as file:
-            offsets, names = file["offsets"][()], file["digests"].asstr()[()]
+            offsets, of_rows = file["offsets"][()], file["digests"].asstr()[()]
             column = file["keypoints"]
             for row, image in enumerate(file["image_ids"][()].tolist()):
                 if image in images:
                     keypoints[image] = column[offsets[row] : offsets[row + 1]]
-                    digests[image] = str(names[row])
+                    digests[image] = str(of_rows[row])
+    for image in sorted(set(images) - keypoints.keys()):
+        raise ArtifactError(
+            f"Image '{names[image]}' has matches, but is in no features file: delete the folders "
+            "extract_features and match_pairs of its scene and run again."
+        )
     return keypoints, digests
 
 

@@ -3,8 +3,9 @@
 import re
 from bisect import bisect_left, bisect_right
 from collections import Counter, defaultdict
-from collections.abc import Hashable, Sequence
+from collections.abc import Container, Hashable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import PurePosixPath
 from typing import Literal
 
@@ -17,6 +18,7 @@ from snakesfm.ingest.exif import Exif, focal_from_exif, is_cropped, is_of_stated
 
 Sharing = Literal["auto", "exif", "single", "per_folder", "per_image"]
 Series = tuple[str, str, str, str]
+Sides = tuple[int, int]
 
 # so many camera models never agree on one image size by themselves: someone cropped to it
 MODELS_OF_ONE_SIZE = 5
@@ -48,7 +50,7 @@ class Photograph:
         return str(PurePosixPath(self.name).parent)
 
     @property
-    def sides(self) -> tuple[int, int]:
+    def sides(self) -> Sides:
         """The shorter and the longer side in pixels."""
         return min(self.width, self.height), max(self.width, self.height)
 
@@ -77,7 +79,7 @@ class Photograph:
         """The last number of the name, -1 where it has none."""
         return int(self._parts[1] or -1)
 
-    @property
+    @cached_property
     def _parts(self) -> tuple[str, str, str]:
         stem = PurePosixPath(self.name).stem
         found = NUMBERED.fullmatch(stem)
@@ -117,14 +119,21 @@ def assign_cameras(
     default_focal_ratio : focal length as a multiple of the longer side where nothing is known.
     use_exif : whether EXIF focal lengths are used.
     """
-    cropped = np.array(find_cropped(photographs), dtype=bool)
+    of_one_size = folders_of_one_size(photographs)
+    cropped = np.array(
+        [
+            p.folder in of_one_size or (p.body is not None and is_cropped(p.exif, p.width, p.height))
+            for p in photographs
+        ],
+        dtype=bool,
+    )
     stated = np.array(
         [focal_from_exif(p.exif, p.width, p.height) if use_exif else np.nan for p in photographs],
         dtype=np.float64,
     )
     unknown = [row for row, camera in enumerate(known) if camera is None]
     groups: dict[int, Hashable] = dict(
-        zip(unknown, group_images([photographs[row] for row in unknown], sharing), strict=True)
+        zip(unknown, group_images([photographs[row] for row in unknown], sharing, of_one_size), strict=True)
     )
     rows_of: dict[Hashable, list[int]] = defaultdict(list)
     for row, camera in enumerate(known):
@@ -143,21 +152,8 @@ def assign_cameras(
     return ImageCameras(cameras, camera_ids, np.where(cropped, np.nan, stated))
 
 
-def find_cropped(photographs: Sequence[Photograph]) -> list[bool]:
-    """Whether each image is not the whole picture that its camera took, so its EXIF focal length misleads.
-
-    That is seen in the image's shape (:func:`snakesfm.ingest.exif.is_cropped`), or in a folder whose images
-    have all one size though many camera models took them.
-    """
-    of_one_size = _folders_of_one_size(photographs)
-    return [
-        p.folder in of_one_size or (p.body is not None and is_cropped(p.exif, p.width, p.height))
-        for p in photographs
-    ]
-
-
-def _folders_of_one_size(photographs: Sequence[Photograph]) -> set[str]:
-    """Folders whose images have all one size though many camera models took them."""
+def folders_of_one_size(photographs: Sequence[Photograph]) -> set[str]:
+    """Folders whose images have all one size though many camera models took them: someone cropped them."""
     sizes = defaultdict(set)
     bodies = defaultdict(set)
     for photograph in photographs:
@@ -171,7 +167,9 @@ def _folders_of_one_size(photographs: Sequence[Photograph]) -> set[str]:
     }
 
 
-def group_images(photographs: Sequence[Photograph], sharing: Sharing) -> list[Hashable]:
+def group_images(
+    photographs: Sequence[Photograph], sharing: Sharing, of_one_size: Container[str]
+) -> list[Hashable]:
     """A key per image; images with equal keys share a camera. Images of different size never do.
 
     Parameters
@@ -182,6 +180,7 @@ def group_images(photographs: Sequence[Photograph], sharing: Sharing) -> list[Ha
         their own, unless EXIF states their very size, as of sensors of 5:4. Images without EXIF share per
         folder where their sizes agree as one camera's do, a few strays apart, or where those of one size
         are a numbered series.
+    of_one_size : folders whose images were cropped to one size (:func:`folders_of_one_size`).
     """
     if sharing == "single":
         return [(p.width, p.height) for p in photographs]
@@ -191,8 +190,7 @@ def group_images(photographs: Sequence[Photograph], sharing: Sharing) -> list[Ha
         return [p.name for p in photographs]
     if sharing == "exif":
         return [_exif_key(p) if p.body else p.name for p in photographs]
-    shared, of_one_size = _shared_sizes(photographs), _folders_of_one_size(photographs)
-    series = _numbered_series(photographs)
+    shared, series = _shared_sizes(photographs), _numbered_series(photographs)
     keys: list[Hashable] = []
     for photograph in photographs:
         if photograph.body:
@@ -212,7 +210,7 @@ def _exif_key(photograph: Photograph) -> Hashable:
     return ("exif", photograph.optics, photograph.width, photograph.height)
 
 
-def _shared_sizes(photographs: Sequence[Photograph]) -> set[tuple[str, tuple[int, int]]]:
+def _shared_sizes(photographs: Sequence[Photograph]) -> set[tuple[str, Sides]]:
     """Folders and sides of images without EXIF that look like those of one camera.
 
     Portrait and landscape count as one size. Crowd photographs differ in size, or stand beside photographs
@@ -220,7 +218,7 @@ def _shared_sizes(photographs: Sequence[Photograph]) -> set[tuple[str, tuple[int
     """
     bodies = defaultdict(set)
     images: Counter[str] = Counter()
-    counts: dict[str, Counter[tuple[int, int]]] = defaultdict(Counter)
+    counts: dict[str, Counter[Sides]] = defaultdict(Counter)
     for photograph in photographs:
         images[photograph.folder] += 1
         if photograph.body:
@@ -235,42 +233,45 @@ def _shared_sizes(photographs: Sequence[Photograph]) -> set[tuple[str, tuple[int
     return shared
 
 
-def _numbered_series(photographs: Sequence[Photograph]) -> set[tuple[Series, tuple[int, int]]]:
+def _numbered_series(photographs: Sequence[Photograph]) -> set[tuple[Series, Sides]]:
     """Series and sides of images without EXIF that look like those of one camera, whatever lies beside.
 
     There are many of them, or the folder holds nothing but a few such series; their numbers are close, and
     next to no other image stands between them, as it does in numbered crowd photographs.
     """
     numbers: dict[Series, list[int]] = defaultdict(list)
-    found: dict[tuple[Series, tuple[int, int]], list[int]] = defaultdict(list)
-    sizes: dict[str, Counter[tuple[int, int]]] = defaultdict(Counter)
-    parts: dict[tuple[str, tuple[int, int]], set[Series]] = defaultdict(set)
+    found: dict[tuple[Series, Sides], list[int]] = defaultdict(list)
     for photograph in photographs:
-        series, sides, folder = photograph.series, photograph.sides, photograph.folder
-        numbers[series].append(photograph.number)
-        sizes[folder][sides] += 1
-        if not photograph.body:
-            parts[folder, sides].add(series)
-            if photograph.number >= 0:
-                found[series, sides].append(photograph.number)
+        numbers[photograph.series].append(photograph.number)
+        if not photograph.body and photograph.number >= 0:
+            found[photograph.series, photograph.sides].append(photograph.number)
     for of_series in numbers.values():
         of_series.sort()
-    alike: set[tuple[Series, tuple[int, int]]] = set()
-    for (series, sides), own in found.items():
-        low, high = min(own), max(own)
-        between = bisect_right(numbers[series], high) - bisect_left(numbers[series], low)
-        if high - low <= LARGEST_STEP * len(own) and len(own) >= SHARE_OF_ONE_SIZE * between:
-            alike.add((series, sides))
-    scattered = {
+    runs = {key for key, own in found.items() if _is_run(own, numbers[key[0]])}
+    scattered = _scattered_folders(photographs, runs)
+    return {key for key in runs if len(found[key]) >= IMAGES_PER_SIZE or key[0][0] not in scattered}
+
+
+def _is_run(own: list[int], numbers: list[int]) -> bool:
+    """Whether the numbers of some images are close, and few other ones of their sorted series between."""
+    low, high = min(own), max(own)
+    between = bisect_right(numbers, high) - bisect_left(numbers, low)
+    return high - low <= LARGEST_STEP * len(own) and len(own) >= SHARE_OF_ONE_SIZE * between
+
+
+def _scattered_folders(photographs: Sequence[Photograph], runs: set[tuple[Series, Sides]]) -> set[str]:
+    """Folders that hold few images of a size, or images of one size without EXIF that are not one run."""
+    sizes: dict[str, Counter[Sides]] = defaultdict(Counter)
+    series_of: dict[tuple[str, Sides], set[Series]] = defaultdict(set)
+    for photograph in photographs:
+        sizes[photograph.folder][photograph.sides] += 1
+        if not photograph.body:
+            series_of[photograph.folder, photograph.sides].add(photograph.series)
+    few = {folder for folder, counts in sizes.items() if min(counts.values()) < IMAGES_PER_SMALL_SIZE}
+    return few | {
         folder
-        for (folder, sides), of_size in parts.items()
-        if len(of_size) > 1 or (next(iter(of_size)), sides) not in alike
-    }
-    scattered |= {folder for folder, of in sizes.items() if min(of.values()) < IMAGES_PER_SMALL_SIZE}
-    return {
-        (series, sides)
-        for series, sides in alike
-        if len(found[series, sides]) >= IMAGES_PER_SIZE or series[0] not in scattered
+        for (folder, sides), found in series_of.items()
+        if len(found) > 1 or (next(iter(found)), sides) not in runs
     }
 
 

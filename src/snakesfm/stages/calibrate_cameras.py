@@ -112,7 +112,7 @@ def _calibrate(
 
 
 class _MatchedImages:
-    """The matches of all pairs, read where they are asked for.
+    """The matches of all pairs, read where they are asked for; the keypoints that these need are kept.
 
     Attributes
     ----------
@@ -123,7 +123,7 @@ class _MatchedImages:
     def __init__(self, job: StageJob, index: ImageIndex) -> None:
         table, self._places = _read_counts(job.paths("matches"))
         self.pairs, self.counts = table[:, :2], table[:, 2]
-        self._features = job.paths("features")
+        self._features, self._names = job.paths("features"), index.names
         self._scales = detector_scales(index.sizes, job.settings)
         self.sizes = detector_sizes(index.sizes, job.settings)
         self._keypoints: dict[int, Array] = {}
@@ -131,7 +131,7 @@ class _MatchedImages:
     def read(self, rows: Array) -> Iterator[tuple[int, Array, Array]]:
         """Some rows, file by file, and their matched keypoints (K,2) in detector pixels, best first."""
         wanted = set(self.pairs[rows].ravel().tolist()) - self._keypoints.keys()
-        found, _ = gather_keypoints(self._features, wanted)
+        found, _ = gather_keypoints(self._features, wanted, self._names)
         for image, points in found.items():
             self._keypoints[image] = reduce_keypoints(points, self._scales[image])
         by_file = sorted(rows.tolist(), key=self._places.__getitem__)
@@ -140,8 +140,6 @@ class _MatchedImages:
                 columns, scores = file["matches"], file["scores"]
                 for row in of_file:
                     i, j = self.pairs[row].tolist()
-                    if i not in self._keypoints or j not in self._keypoints:
-                        continue
                     part = slice(*self._places[row][1:])
                     # best first: the estimator draws from the first ones sooner
                     order = np.argsort(-scores[part], kind="stable")

@@ -12,7 +12,6 @@ from snakesfm.arrays import Array
 from snakesfm.artifacts.gather import gather_keypoints
 from snakesfm.artifacts.images import CalibratedCameras, ImageIndex
 from snakesfm.artifacts.pairs import KINDS, REJECTIONS, PairMatches, TwoViewGeometries
-from snakesfm.errors import ArtifactError
 from snakesfm.geometry.camera import Camera, cameras_from_columns
 from snakesfm.geometry.detector_pixels import (
     detector_scales,
@@ -43,15 +42,10 @@ def run(job: StageJob) -> None:
     of_camera = reduce_cameras(cameras_from_columns(*cameras.camera_columns), job.settings)
     matches = PairMatches.read(job.path("matches"))
     images = set(matches.pairs.ravel().tolist())
-    found, image_digests = gather_keypoints(job.paths("features"), images)
+    found, image_digests = gather_keypoints(job.paths("features"), images, index.names)
     scales = detector_scales(index.sizes, job.settings)
     keypoints = {image: reduce_keypoints(points, scales[image]) for image, points in found.items()}
     places = {image: first_rows_at_place(points) for image, points in keypoints.items()}
-    for image in images - keypoints.keys():
-        raise ArtifactError(
-            f"{job.path('matches')} names image {index.names[image]}, which is in no features file: "
-            "delete both and run again."
-        )
     pairs: list[tuple[int, int]] = [(int(i), int(j)) for i, j in matches.pairs]
     cameras_of = [(of_camera[index.camera_ids[i]], of_camera[index.camera_ids[j]]) for i, j in pairs]
     seeds = [job.seed_for(str(index.names[i]), str(index.names[j])) for i, j in pairs]

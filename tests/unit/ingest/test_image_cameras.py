@@ -4,7 +4,13 @@ import numpy as np
 import pytest
 
 from snakesfm.geometry.camera import Camera
-from snakesfm.ingest.cameras import Photograph, assign_cameras, group_images, warn_of_own_cameras
+from snakesfm.ingest.cameras import (
+    Photograph,
+    assign_cameras,
+    folders_of_one_size,
+    group_images,
+    warn_of_own_cameras,
+)
 from snakesfm.ingest.exif import Exif
 
 PHONE = Exif("DJI", "FC6310", focal_mm=8.8)
@@ -22,7 +28,7 @@ def assign(photographs, known=None, **changes):
 
 
 def group_sizes(photographs, sharing="auto"):
-    keys = group_images(photographs, sharing)
+    keys = group_images(photographs, sharing, folders_of_one_size(photographs))
     return sorted(keys.count(key) for key in set(keys))
 
 
@@ -175,6 +181,13 @@ def test_one_size_of_many_cameras_is_not_trusted():
     assert found.cameras[0].focal_px == pytest.approx(100 * np.hypot(760, 1140) / np.hypot(36, 24))
     three = assign(mixed[:3])
     assert {camera.source for camera in three.cameras} == {"exif"}
+
+
+def test_crops_of_many_cameras_do_not_share_one_where_another_is_known():
+    mixed = [Photograph(f"{k}.jpg", 760, 1140, Exif("X", f"M{k % 5}", focal_35mm=100)) for k in range(6)]
+    given = Camera("PINHOLE", 760, 1140, (900, 900, 380, 570), "given")
+    assert len(assign(mixed).cameras) == 6
+    assert len(assign(mixed, [None, given, *[None] * 4]).cameras) == 6
 
 
 @pytest.mark.parametrize(

@@ -250,6 +250,12 @@ def test_matches_of_unknown_images_are_refused(two_views: Views, tmp_path: Path)
     inputs["features"] = []
     with pytest.raises(ArtifactError, match=r"a\.jpg"):
         estimate_two_view.run(pose_job(tmp_path, inputs))
+    options = CalibrateCamerasOptions(min_matches=20)
+    inputs = write_inputs(tmp_path, views, "default") | {"features": []}
+    with pytest.raises(ArtifactError, match=r"a\.jpg"):
+        calibrate_cameras.run(
+            StageJob("calibrate_cameras", "scene", inputs, (tmp_path / "out.h5",), options)
+        )
 
 
 @pytest.mark.parametrize(
