@@ -44,6 +44,24 @@ def write_images(database: pycolmap.Database, names: list[str], camera_ids: Arra
         database.write_frame(frame, use_frame_id=True)
 
 
+def write_positions(database: pycolmap.Database, gps: Array, camera_ids: Array) -> None:
+    """Write pose priors of images of which all three are known, as COLMAP's own import does.
+
+    Parameters
+    ----------
+    gps : (N,3) latitude and longitude in degrees, altitude in metres, NaN where unknown.
+    camera_ids : (N,) int, row of each image's camera among those written.
+    """
+    for row in np.flatnonzero(np.isfinite(gps).all(axis=1)).tolist():
+        sensor = pycolmap.sensor_t(type=pycolmap.SensorType.CAMERA, id=int(camera_ids[row]) + 1)
+        prior = pycolmap.PosePrior(
+            position=gps[row],
+            coordinate_system=pycolmap.PosePriorCoordinateSystem.WGS84,
+            corr_data_id=pycolmap.data_t(sensor_id=sensor, id=row + 1),
+        )
+        database.write_pose_prior(prior)
+
+
 def keypoint_rows(keypoints: Array, scales: Array, angles: Array) -> Array:
     """COLMAP's keypoints (K,4) float32: x, y in pixels, scale (sigma) in pixels, orientation in radians.
 

@@ -26,7 +26,7 @@ SIFT_SIZE = 128
 
 def run(job: StageJob) -> None:
     """Write the database, complete or not at all, holding one block or tile in memory at a time."""
-    from snakesfm.export.database import write_cameras, write_images
+    from snakesfm.export.database import write_cameras, write_images, write_positions
     from snakesfm.geometry.colmap_binding import pycolmap
 
     options: ExportDatabaseOptions = job.options
@@ -39,6 +39,7 @@ def run(job: StageJob) -> None:
             with pycolmap.DatabaseTransaction(database):
                 write_cameras(database, cameras)
                 write_images(database, [str(image) for image in index.names], index.camera_ids)
+                write_positions(database, index.gps, index.camera_ids)
             for file in job.paths("features"):
                 with pycolmap.DatabaseTransaction(database):
                     _write_features(database, file, options.descriptors)

@@ -29,6 +29,10 @@ COUNT = 12
 HEADER = Header("test", 1, "scene")
 NAMES = [f"day 1/ü{k:02d}.jpg" for k in range(COUNT)]
 SIZE = (640, 480)
+GPS = np.full((COUNT, 3), np.nan)
+GPS[2] = 48.5, -2.25, 120.0
+# COLMAP does not read a position without altitude either
+GPS[4, :2] = 48.5, -2.25
 GUESSED = Camera("SIMPLE_RADIAL", *SIZE, (500.0, 320.0, 240.0, 0.0), "default")
 CAMERAS = [Camera("PINHOLE", *SIZE, (500.0, 500.0, 320.0, 240.0), "given"), GUESSED]
 ROTATION_ONLY, REJECTED = 0, 1
@@ -56,7 +60,7 @@ def write_inputs(folder: Path, problem: SyntheticProblem) -> dict[str, str | lis
         camera_ids=np.arange(COUNT) % 2,
         orientations=np.ones(COUNT, np.int32),
         focal_exif_px=np.full(COUNT, np.nan),
-        gps=np.full((COUNT, 3), np.nan),
+        gps=GPS,
         duplicate_of=np.full(COUNT, -1),
         camera_models=models,
         camera_sizes=sizes,
@@ -169,6 +173,14 @@ def test_cameras_and_images_come_with_trivial_rigs_and_frames(database) -> None:
         assert [(data.sensor_id.id, data.id) for data in frame.data_ids] == [
             (image.camera_id, image.image_id)
         ]
+
+
+def test_gps_is_a_pose_prior(database) -> None:
+    (prior,) = database.read_all_pose_priors()
+    np.testing.assert_array_equal(prior.position, GPS[2])
+    assert prior.coordinate_system == pycolmap.PosePriorCoordinateSystem.WGS84
+    assert prior.corr_data_id == database.read_image(3).data_id
+    assert not prior.has_position_cov()
 
 
 def test_features_are_those_of_the_artifacts(database, problem: SyntheticProblem) -> None:
