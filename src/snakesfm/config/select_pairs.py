@@ -15,7 +15,7 @@ SHORTLIST = 100
 class SelectPairsOptions(StageOptions):
     """Which pairs of images are matched."""
 
-    stage_version: ClassVar[int] = 5
+    stage_version: ClassVar[int] = 6
 
     method: Literal[
         "auto",
@@ -27,8 +27,8 @@ class SelectPairsOptions(StageOptions):
         "sequential+spatial",
         "listed",
     ] = "auto"
-    """All pairs, neighbours by name, similar images, neighbours by GPS, or your list; 'auto' takes your
-    list, else all pairs of few images, else sequential+retrieval."""
+    """All pairs, neighbours by name, similar images, neighbours by GPS (by name where an image has none),
+    or your list; 'auto' takes your list, else all pairs of few images, else sequential+retrieval."""
 
     exhaustive_up_to: Annotated[int, Field(ge=2, le=100_000)] | Literal["auto"] = "auto"
     """Number of images up to which 'auto' takes all pairs; 'auto' is 1000 if pairs are previewed with

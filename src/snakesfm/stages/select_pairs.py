@@ -1,6 +1,7 @@
 """Choose the pairs of images that are matched."""
 
 import itertools
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -117,7 +118,18 @@ def _choose(job: StageJob, index: ImageIndex, options: "SelectPairsOptions", pai
     if "sequential" in options.method:
         table = table.union(sequential_pairs(names, options.look_ahead))
     if "spatial" in options.method:
-        table = table.union(spatial_pairs(_local_places(index), int(options.top_k)))
+        places = _local_places(index)
+        table = table.union(spatial_pairs(places, int(options.top_k)))
+        unplaced = np.isnan(places).any(axis=1)
+        if unplaced.any():
+            job.warn(
+                f"{unplaced.sum()} of {len(names)} images have no GPS position in EXIF: they are paired with "
+                "neighbours by name alone."
+            )
+        if options.method == "spatial":
+            # as many before and behind as others have around
+            by_name = sequential_pairs(names, math.ceil(int(options.top_k) / 2))
+            table = table.union(by_name.take(np.flatnonzero(unplaced[by_name.pairs].any(axis=1))))
     if "retrieval" in options.method:
         table = table.union(_retrieve(job.paths("descriptors"), options, job.threads))
     return table
@@ -135,9 +147,6 @@ def _local_places(index: ImageIndex) -> Array:
             "select_pairs.method pairs images by their GPS position, but none has one in EXIF: "
             "use --config 'select_pairs={method: sequential+retrieval}'."
         )
-    without = int(np.isnan(places).any(axis=1).sum())
-    if without:
-        print(f"warning: {without} of {len(places)} images have no GPS position in EXIF")
     return local_metres(places, origin)[:, :2]
 
 
