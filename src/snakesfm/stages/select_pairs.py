@@ -123,8 +123,8 @@ def _choose(job: StageJob, index: ImageIndex, options: "SelectPairsOptions", pai
         unplaced = np.isnan(places).any(axis=1)
         if unplaced.any():
             job.warn(
-                f"{unplaced.sum()} of {len(names)} images have no GPS position in EXIF: they are paired with "
-                "neighbours by name alone."
+                f"{unplaced.sum()} of {len(names)} images have no GPS position in EXIF: they are paired "
+                "with neighbours by name alone."
             )
         if options.method == "spatial":
             # as many before and behind as others have around
