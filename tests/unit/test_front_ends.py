@@ -31,6 +31,7 @@ from snakesfm.rule_inputs import (
     coordinate_files,
     described_features,
     described_images,
+    exported_keypoints,
     keypoint_files,
     match_files,
     matched_features,
@@ -221,7 +222,9 @@ def test_without_keypoints_the_stages_after_matching_read_merged_ones(tmp_path: 
     assert sift.features_stage == "extract_features" and sift.matches_stage == "match_pairs"
     assert not any("merge_keypoints" in file for file in sift.all_files())
     assert matched_features(sift, "0-1") == tile_features(sift, "0-1") == keypoint_files(sift)
-    assert matched_images(sift) == coordinate_files(sift) == []
+    assert matched_images(sift) == coordinate_files(sift) == exported_keypoints(sift) == []
+    (complete,) = plan_of(tmp_path, export_model={"all_keypoints": True}).scenes.values()
+    assert exported_keypoints(complete) == keypoint_files(sift)
     assert tile_matches(sift, "0-1") in match_files(sift) == sift.files("match_pairs", "tiles")
 
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from snakesfm.artifacts import CalibratedCameras, ImageIndex, Reconstruction, temporary_folder
+from snakesfm.artifacts.gather import gather_image_columns
 from snakesfm.export.colmap import (
     build_reconstruction,
     other_model_sizes,
@@ -115,10 +116,11 @@ def run(job: StageJob) -> None:
     for line in warnings:
         sys.stderr.write(f"warning: {line}\n")
     folder = _export_folder(job)
+    keypoints = _all_keypoints(job, index)
     with temporary_folder(folder) as temporary:
         for number in range(max(1, adjusted.model_count)):
             selected = _placed(job, index, adjusted.select_model(number))[0] if number else model
-            _write_colmap(temporary, number, _build(names, index, cameras, selected))
+            _write_colmap(temporary, number, _build(names, index, cameras, selected, keypoints))
         content = transforms(
             names, index.camera_ids, cameras, model.rotations, model.translations, registered, masks
         )
@@ -252,8 +254,19 @@ def _placed(
     return replace(model, rotations=rotations, translations=translations, points=points), place
 
 
+def _all_keypoints(job: StageJob, index: ImageIndex) -> list[np.ndarray] | None:
+    """Per image its keypoints (K_i,2) in original pixels where all are wanted in the model, else None."""
+    if not job.options.all_keypoints:
+        return None
+    return gather_image_columns(job.paths("features"), len(index.names), "keypoints")[0]
+
+
 def _build(
-    names: list[str], index: ImageIndex, cameras: list[Camera], model: Reconstruction
+    names: list[str],
+    index: ImageIndex,
+    cameras: list[Camera],
+    model: Reconstruction,
+    keypoints: list[np.ndarray] | None,
 ) -> "pycolmap.Reconstruction":
     return build_reconstruction(
         names,
@@ -267,6 +280,7 @@ def _build(
         model.offsets,
         model.image_ids,
         model.keypoints,
+        None if keypoints is None else (model.keypoint_ids, keypoints),
     )
 
 

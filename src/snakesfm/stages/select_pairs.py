@@ -120,7 +120,7 @@ def _choose(job: StageJob, index: ImageIndex, options: "SelectPairsOptions", pai
     if "spatial" in options.method:
         places = _local_places(index)
         table = table.union(spatial_pairs(places, int(options.top_k)))
-        unplaced = np.isnan(places).any(axis=1)
+        unplaced = ~np.isfinite(places[:, 0])
         if unplaced.any():
             job.warn(
                 f"{unplaced.sum()} of {len(names)} images have no GPS position in EXIF: they are paired "

@@ -19,6 +19,7 @@ from snakesfm.artifacts import (
     CameraRotations,
     Header,
     ImageIndex,
+    LocalFeatures,
     Reconstruction,
     TrackTable,
     TriangulatedPoints,
@@ -137,6 +138,27 @@ def write_reconstruction(
     return folder / "reconstruction.h5"
 
 
+def write_features(folder: Path, problem: SyntheticProblem) -> Path:
+    """The keypoints a quarter of a pixel from where they were refined to, and one of no point in each image."""
+    keypoints = [np.vstack([found + 0.25, [[7.0, 9.0]]]) for found in problem.keypoints]
+    counts = [len(found) for found in keypoints]
+    total = sum(counts)
+    LocalFeatures(
+        image_ids=np.arange(COUNT),
+        names=NAMES,
+        digests=["d"] * COUNT,
+        sizes=np.tile([640, 480], (COUNT, 1)),
+        offsets=np.concatenate([[0], np.cumsum(counts)]),
+        keypoints=np.concatenate(keypoints).astype(np.float32),
+        descriptors=np.zeros((total, 0), np.uint8),
+        scores=np.ones(total, np.float32),
+        scales=np.ones(total, np.float32),
+        angles=np.zeros(total, np.float32),
+        colors=np.zeros((total, 3), np.uint8),
+    ).write(folder / "features.h5", HEADER)
+    return folder / "features.h5"
+
+
 def make_images(folder: Path) -> Path:
     for name in NAMES:
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
@@ -158,6 +180,7 @@ def export(
     inputs = {
         "index": str(write_index(tmp_path, orientations, gps)),
         "cameras": str(write_cameras(tmp_path)),
+        "features": [str(write_features(tmp_path, problem))],
         "reconstruction": str(write_reconstruction(tmp_path, problem, lost, reset, offset)),
     }
     folder = tmp_path / "out" / "scene" / "export_model"
@@ -203,6 +226,23 @@ def test_colmap_reads_what_was_reconstructed_from_binary_and_text(tmp_path, prob
         row = np.flatnonzero(problem.track_image_ids[slice(*problem.track_offsets[4:6])] != LOST)[0]
         expected = problem.track_keypoints[problem.track_offsets[4] + row]
         assert observed.xy == pytest.approx(expected, abs=1e-5)
+
+
+def test_all_keypoints_are_numbered_as_the_features_are(tmp_path, problem) -> None:
+    model = read_model(export(tmp_path, problem, all_keypoints=True) / "sparse" / "0")
+    some = read_model(export(tmp_path / "some", problem) / "sparse" / "0")
+    for image_id, image in model.images.items():
+        keypoints = problem.keypoints[image_id - 1]
+        pixels = np.array([point.xy for point in image.points2D])
+        np.testing.assert_allclose(pixels, np.vstack([keypoints, [[7, 9]]]), atol=1e-4)
+        assert [point.has_point3D() for point in image.points2D] == [True] * len(keypoints) + [False]
+        assert some.images[image_id].num_points2D() == len(keypoints)
+    for point_id, point in model.points3D.items():
+        assert np.allclose(point.xyz, some.points3D[point_id].xyz)
+        rows = slice(*problem.track_offsets[point_id - 1 : point_id + 1])
+        there = zip(problem.track_image_ids[rows] + 1, problem.track_keypoint_ids[rows], strict=True)
+        found = [(element.image_id, element.point2D_idx) for element in point.track.elements]
+        assert found == [(i, k) for i, k in there if i != LOST + 1]
 
 
 def test_reprojection_in_the_exported_model_is_that_of_the_noise(tmp_path, problem) -> None:
