@@ -9,7 +9,7 @@ from snakesfm.export.image_folder import place_images
 MAKE, ORIENTATION = 0x010F, 0x0112
 
 
-@pytest.mark.parametrize("suffix", ["jpg", "png", "tif", "webp"])
+@pytest.mark.parametrize("suffix", ["jpg", "png", "tif", "big.tif", "webp"])
 @pytest.mark.parametrize("order", ["<", ">"])
 def test_nothing_but_the_orientation_of_a_turned_image_changes(tmp_path, suffix, order) -> None:
     photos = tmp_path / "photos"
@@ -18,7 +18,9 @@ def test_nothing_but_the_orientation_of_a_turned_image_changes(tmp_path, suffix,
     exif = Image.Exif()
     exif.endian = order
     exif[ORIENTATION], exif[MAKE] = 8, "maker"
-    Image.fromarray(np.arange(48 * 64, dtype=np.uint8).reshape(48, 64)).save(photos / name, exif=exif)
+    Image.fromarray(np.arange(48 * 64, dtype=np.uint8).reshape(48, 64)).save(
+        photos / name, exif=exif, **({"big_tiff": True} if suffix == "big.tif" else {})
+    )
     place_images(tmp_path / "images", photos, [name], np.array([8]))
     before, after = ((folder / name).read_bytes() for folder in (photos, tmp_path / "images"))
     # the lower byte of the orientation, and in PNG the four of a checksum
