@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from snakesfm.config.configuration import (
     STAGES,
-    TEXT_KEYS,
+    RunOptions,
     check_spelling,
     list_scenes,
     load_configuration,
@@ -115,7 +115,9 @@ def test_scene_takes_the_name_of_its_folder_or_of_its_parent() -> None:
 @pytest.mark.parametrize("value", [2024, datetime.date(2024, 5, 1)])
 def test_what_looks_like_a_number_or_a_date_is_a_name(value: object) -> None:
     assert list(list_scenes(load_configuration({"images": "x", "scene": value}))) == [str(value)]
-    for key in TEXT_KEYS:
+    free = [key for key, field in RunOptions.model_fields.items() if field.annotation is str]
+    assert {"images", "cameras", "weights"} < set(free)
+    for key in free:
         assert getattr(load_configuration({key: value}), key) == str(value)
     assert list(load_configuration({"scenes": {value: {"images": "x"}}}).scenes) == [str(value)]
 
