@@ -204,13 +204,13 @@ def test_up_is_that_of_the_cameras_in_any_world() -> None:
 
 def test_up_of_cameras_that_look_down_from_all_sides_is_against_their_view() -> None:
     rng = np.random.default_rng(0)
-    down = np.array([[1.0, 0, 0], [0, -1, 0], [0, 0, -1]])
-    rotations = np.array([exp_so3(np.array([0, 0, a])) @ down for a in np.linspace(0, 2 * np.pi, 9)[:-1]])
+    turns = [exp_so3(np.array([0, 0, angle])) for angle in np.linspace(0, 2 * np.pi, 9)[:-1]]
     centers = np.column_stack([rng.uniform(-9, 9, (8, 2)), 20 + rng.normal(0, 0.01, 8)])
-    for turn in (np.eye(3), np.diag([1.0, -1.0, -1.0])):
-        turned, moved = rotations @ turn.T, centers @ turn.T
-        axes = view_axes(turned, translation_of(turned, moved))
-        assert axes[2] == pytest.approx(turn @ [0.0, 0.0, 1.0], abs=0.01)
+    # the same centres, from which they look down or up
+    for look, up in ((np.diag([1.0, -1, -1]), 1.0), (np.eye(3), -1.0)):
+        rotations = np.array([turn @ look for turn in turns])
+        axes = view_axes(rotations, translation_of(rotations, centers))
+        assert axes[2] == pytest.approx([0.0, 0.0, up], abs=0.01)
 
 
 def test_the_map_is_seen_from_above_with_the_first_axis_to_the_right() -> None:
