@@ -32,9 +32,11 @@ def place_images(target: Path, images: Path, names: Sequence[str], orientations:
     names : images relative to it; the files that are placed where one link does not do.
     orientations : (N,) EXIF orientation of each image.
     """
+    # the folder of the photographs may be given as the very link that is made here
+    images = images.resolve()
     if target.is_symlink() or target.is_file():
         target.unlink()
-    elif target.is_dir() and target.resolve() == images.resolve():
+    elif target.is_dir() and target.resolve() == images:
         return
     elif target.is_dir():
         shutil.rmtree(target)

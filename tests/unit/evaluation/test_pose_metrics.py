@@ -254,6 +254,9 @@ def test_names_match_by_path_and_else_by_a_unique_file_name() -> None:
         -1,
     ]
     assert match_names(["1.jpg"], ["a/1.jpg", "b/1.jpg"]).tolist() == [-1, -1]
+    # no image is that of two, whichever of its names decides
+    assert match_names(["a/1.jpg"], ["a/1.jpg", "1.jpg", "1.png"]).tolist() == [0, -1, -1]
+    assert match_names(["a/1.jpg"], ["b/1.jpg", "c/1.png"]).tolist() == [0, -1]
     assert match_names(["a/1.jpg"], ["a/1.jpg", "b/1.jpg"]).tolist() == [0, -1]
 
 
