@@ -277,7 +277,10 @@ class ScenePlan:
     def artifacts(self) -> list[str]:
         """The artifacts of all stages."""
         files = [str(self.folder / name) for name in SCENE_ARTIFACTS]
-        files += self.files(self.features_stage, "blocks")
+        if self.detects_keypoints:
+            files += self.files("extract_features", "blocks")
+        if self.detector_free:
+            files += self.files("merge_keypoints", "blocks")
         for stage in dict.fromkeys(
             ("select_pairs", "match_pairs", self.matches_stage, "estimate_two_view")
         ):

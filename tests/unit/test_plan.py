@@ -91,6 +91,27 @@ def test_small_scenes_are_exhaustive_and_large_ones_retrieve(tmp_path: Path) -> 
     assert previewed_features(learned.scenes["small"]) == []
 
 
+@pytest.mark.parametrize(
+    ("front_end", "method", "stages"),
+    [
+        ("sift", "retrieval", {"extract_features"}),
+        ("loftr", "retrieval", {"extract_features", "merge_keypoints"}),
+        ("loftr", "exhaustive", {"merge_keypoints"}),
+    ],
+)
+def test_keypoints_are_artifacts_wherever_they_are_made(
+    tmp_path: Path, front_end: str, method: str, stages: set[str]
+) -> None:
+    images = str(make_images(tmp_path / "scene", 5))
+    plan = plan_of(tmp_path, images=images, front_end=front_end, select_pairs={"method": method})
+    scene = plan.scenes["scene"]
+    files = scene.artifacts()
+    assert len(files) == len(set(files))
+    made = {Path(file).parent.name for file in files}
+    assert made & {"extract_features", "merge_keypoints"} == stages
+    assert all(set(scene.files(stage, "blocks")) <= set(files) for stage in stages)
+
+
 def test_params_are_canonical_and_follow_content_not_time(tmp_path: Path) -> None:
     folder = make_images(tmp_path / "scene", 3)
     first = plan_of(tmp_path, images=str(folder)).scenes["scene"].params("index_images", {}, True)
