@@ -8,7 +8,7 @@ import re
 import subprocess
 import threading
 import time
-from collections.abc import Mapping, Set
+from collections.abc import Iterator, Mapping, Set
 from pathlib import Path
 from typing import Any
 
@@ -47,31 +47,24 @@ class Run:
         ------
         ConfigError : another run is writing to the folder.
         """
-        self._refuse_locked()
-        for scene in self.plan.scenes.values():
-            for path in unrecorded_files(() if asked & MAKES_PART else scene.results(asked)):
+        with self._beside_no_other():
+            for scene in self.plan.scenes.values():
+                for path in unrecorded_files(() if asked & MAKES_PART else scene.results(asked)):
+                    with contextlib.suppress(OSError):
+                        forget(path)
+                unknown = unrecorded_files(scene.artifacts())
+                if unknown:
+                    _set_aside(scene, unknown)
+
+    @contextlib.contextmanager
+    def _beside_no_other(self) -> Iterator[None]:
+        """Refuse to work beside another run, also without jobs of its own, and have none start meanwhile."""
+        with contextlib.ExitStack() as stack:
+            if self.plan.scenes:
                 with contextlib.suppress(OSError):
-                    forget(path)
-            unknown = unrecorded_files(scene.artifacts())
-            if not unknown:
-                continue
-            # loaded here, as most runs know their files and h5py takes a tenth of a second
-            from snakesfm.artifacts.checks import ASIDE, set_aside
-
-            found = set_aside(unknown, scene.name, scene.options_digests, scene.settings_text)
-            if found:
-                print(
-                    f"snakesfm: scene '{scene.name}': {len(found)} files without a record in this folder's "
-                    f".snakemake were renamed to *{ASIDE} and will be recreated: {found[0]}.",
-                    flush=True,
-                )
-
-    def _refuse_locked(self) -> None:
-        """Refuse to work beside another run; a run without jobs would not come to take the lock."""
-        if not self.plan.scenes:
-            return
-        with contextlib.suppress(OSError), (self.plan.output / LOCK_NAME).open(encoding="utf-8") as lock:
-            self._lock(lock, fcntl.LOCK_SH)
+                    lock = stack.enter_context((self.plan.output / LOCK_NAME).open(encoding="utf-8"))
+                    self._lock(lock, fcntl.LOCK_SH)
+            yield
 
     def _lock(self, lock: Any, how: int) -> None:
         """Lock the output folder, as far as the file system can, or refuse where another run holds it."""
@@ -288,6 +281,20 @@ class Run:
             f"{summary['mean_reprojection_error_px']:.3f} px{accuracy}, "
             f"{time.time() - self.started:.0f} s; model in {scene.folder / 'export_model' / 'sparse' / '0'}"
             f"{', ' + in_database if in_database else ''}"
+        )
+
+
+def _set_aside(scene: ScenePlan, unknown: list[Path]) -> None:
+    """Rename those of a scene's files that are not as this run would make them, and say so."""
+    # loaded here, as most runs know their files and h5py takes a tenth of a second
+    from snakesfm.artifacts.checks import ASIDE, set_aside
+
+    found = set_aside(unknown, scene.name, scene.options_digests, scene.settings_text)
+    if found:
+        print(
+            f"snakesfm: scene '{scene.name}': {len(found)} files without a record in this folder's "
+            f".snakemake were renamed to *{ASIDE} and will be recreated: {found[0]}.",
+            flush=True,
         )
 
 
