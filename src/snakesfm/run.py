@@ -58,7 +58,7 @@ class Run:
 
     @contextlib.contextmanager
     def _beside_no_other(self) -> Iterator[None]:
-        """Refuse to work beside another run, also without jobs of its own, and have none start meanwhile."""
+        """Refuse to work beside another run, also without own jobs, and have none start meanwhile."""
         with contextlib.ExitStack() as stack:
             if self.plan.scenes:
                 with contextlib.suppress(OSError):

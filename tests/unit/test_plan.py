@@ -12,6 +12,7 @@ from snakesfm.config.configuration import STAGES, options_class
 from snakesfm.digests import file_digest, settings_text
 from snakesfm.errors import ConfigError
 from snakesfm.plan import Plan
+from snakesfm.records import split_words
 from snakesfm.rule_inputs import global_descriptors, previewed_features
 from snakesfm.rule_settings import check_named_together
 from snakesfm.seeding import derive_seed
@@ -150,18 +151,20 @@ def test_scenes_of_other_sizes_have_rules_of_their_own(tmp_path: Path) -> None:
         ("--until select_pairs", True),
         ("--until=select_pairs", True),
         ("-R match_pairs select_pairs", True),
+        ("-kUselect_pairs", True),
         ("--until select_pairs select_pairs_2_blocks", False),
         ("--until match_pairs --set-resources select_pairs:mem_mb=10 --set-threads select_pairs=1", False),
         ("--until select_pairs_2_blocks", False),
     ],
 )
 def test_a_rule_is_named_with_its_twins_or_not_at_all(words: str, is_refused: bool) -> None:
+    said = split_words(words.split())
     if is_refused:
         with pytest.raises(ConfigError, match="say 'select_pairs select_pairs_2_blocks'"):
-            check_named_together(words.split(), "select_pairs", {"select_pairs_2_blocks"})
+            check_named_together(said, "select_pairs", {"select_pairs_2_blocks"})
     else:
-        check_named_together(words.split(), "select_pairs", {"select_pairs_2_blocks"})
-    check_named_together(words.split(), "select_pairs", set())
+        check_named_together(said, "select_pairs", {"select_pairs_2_blocks"})
+    check_named_together(said, "select_pairs", set())
 
 
 @pytest.mark.parametrize("output", ["{braces}", "a{b"])

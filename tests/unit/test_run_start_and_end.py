@@ -9,6 +9,7 @@ import pytest
 from snakesfm.artifacts import Header, ImagePairs, checks
 from snakesfm.errors import ConfigError
 from snakesfm.plan import Plan
+from snakesfm.records import split_words
 from snakesfm.run import Run
 
 
@@ -49,3 +50,30 @@ def test_no_other_run_starts_while_files_are_set_aside(
     assert "1 files without a record" in capsys.readouterr().out
     assert [path.name for path in file.parent.iterdir()] == ["0-0.h5.refused"]
     start_and_end(plan)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "stays"),
+    [
+        ("--until build_tracks", True),
+        ("--until=build_tracks", True),
+        ("-Ubuild_tracks", True),
+        ("-kU build_tracks", True),
+        ("--omit-from=export_model", True),
+        ("--cores=all -R build_tracks", False),
+        ("-Rbuild_tracks", False),
+        ("databases --cores=all", True),
+        ("-call databases", True),
+        ("all databases", False),
+    ],
+)
+def test_an_unrecorded_model_is_made_again_where_all_is_made(
+    plan: Plan, arguments: str, stays: bool
+) -> None:
+    summary = Path("out/s/export_model/summary.json")
+    summary.parent.mkdir(parents=True)
+    summary.touch()
+    made = summary.stat().st_mtime
+    assert made > 1
+    Run(plan).refuse_unrecorded(split_words(arguments.split()))
+    assert summary.stat().st_mtime == (made if stays else 1)
