@@ -21,6 +21,7 @@ from snakesfm.scene_plan import ScenePlan
 
 LOCK_NAME = ".snakesfm.lock"
 MOST_SENTENCES = 10
+RELATIVE_AUC = re.compile(r"relative_pose_auc_(.+)deg")
 
 
 class Run:
@@ -272,9 +273,7 @@ class Run:
             return f"snakesfm: scene '{scene.name}': {', '.join(filter(None, (in_database, model)))}."
         others = summary.get("images_in_other_models", [])
         more = f" and {sum(others)} in {len(others)} other models" if others else ""
-        accuracy = ""
-        with contextlib.suppress(KeyError):
-            accuracy = _describe_accuracy(self._read_result(scene, "evaluate_model", "metrics.json"))
+        accuracy = _describe_accuracy(self._read_result(scene, "evaluate_model", "metrics.json"))
         return (
             f"snakesfm: scene '{scene.name}': {summary['registered_images']} of {summary['images']} images "
             f"registered{more}, {summary['points']} points, mean reprojection error "
@@ -299,13 +298,18 @@ def _set_aside(scene: ScenePlan, unknown: list[Path]) -> None:
 
 
 def _describe_accuracy(metrics: dict[str, Any]) -> str:
-    """A clause on how near a model is to its reference."""
+    """A clause on how near a model is to its reference; empty where there is none."""
+    if "reference_images" not in metrics:
+        return ""
     images, present = metrics["reference_images"], metrics["reference_images_present"]
     if not present:
         return ", no image name occurs in the reference, so nothing is evaluated"
-    areas = [f"{metrics[f'relative_pose_auc_{degrees}deg']:.1f}" for degrees in (1, 3, 5)]
+    found = [column for column in map(RELATIVE_AUC.fullmatch, metrics) if column]
+    found.sort(key=lambda column: float(column[1]))
+    areas = "/".join(f"{metrics[column[0]]:.1f}" for column in found)
+    thresholds = "/".join(column[1] for column in found)
     share = f" over the reference's {images} images, {present} of them here" if present < images else ""
-    return f", relative-pose AUC {'/'.join(areas)} at 1/3/5 deg{share}"
+    return f", relative-pose AUC {areas} at {thresholds} deg{share}"
 
 
 def _cancel_timers() -> None:

@@ -4,10 +4,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
-from snakesfm.artifacts import Header, ImagePairs, checks
+from snakesfm.artifacts import Header, ImagePairs, checks, write_json
 from snakesfm.errors import ConfigError
+from snakesfm.evaluation.metrics import Poses, evaluate_poses
 from snakesfm.plan import Plan
 from snakesfm.records import split_words
 from snakesfm.run import Run
@@ -77,3 +79,37 @@ def test_an_unrecorded_model_is_made_again_where_all_is_made(
     assert made > 1
     Run(plan).refuse_unrecorded(split_words(arguments.split()))
     assert summary.stat().st_mtime == (made if stays else 1)
+
+
+def say_accuracy(plan: Plan, metrics: dict[str, Any]) -> str:
+    """The last line of a run whose model has these metrics."""
+    model = {"registered_images": 4, "images": 4, "points": 9, "mean_reprojection_error_px": 0.5}
+    write_json(Path("out/s/export_model/summary.json"), model)
+    write_json(Path("out/s/evaluate_model/metrics.json"), metrics)
+    return Run(plan).describe(plan.scenes["s"])
+
+
+@pytest.mark.parametrize(
+    ("thresholds_deg", "said"),
+    [
+        ((20.0, 1.0, 10.0), "relative-pose AUC 50.0/67.9/84.0 at 1/10/20 deg"),
+        ((2.5,), "relative-pose AUC 50.0 at 2.5 deg"),
+    ],
+)
+def test_accuracy_is_said_at_the_thresholds_that_it_was_evaluated_at(
+    plan: Plan, thresholds_deg: tuple[float, ...], said: str
+) -> None:
+    names = [f"{k}.jpg" for k in range(4)]
+    centers = np.random.default_rng(0).normal(size=(4, 3))
+    reference = Poses(names, np.tile(np.eye(3), (4, 1, 1)), -centers)
+    angle = np.radians(7.0)
+    turned = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
+    # one of four images is turned on the spot: half of the pairs are exact, the others off by 7 degrees
+    rotations, translations = reference.rotations.copy(), -centers
+    rotations[0], translations[0] = turned, turned @ translations[0]
+    model = Poses(names, rotations, translations)
+    assert f", {said}, " in say_accuracy(plan, evaluate_poses(model, reference, thresholds_deg).metrics)
+
+
+def test_without_a_reference_nothing_is_said_of_accuracy(plan: Plan) -> None:
+    assert "AUC" not in say_accuracy(plan, {"scene": "s", "registered_images": 4})
