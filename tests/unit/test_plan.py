@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from snakesfm.blocks import choose_blocks, deal_blocks, tile_names
 from snakesfm.config.configuration import STAGES, options_class
-from snakesfm.digests import file_digest, settings_text
+from snakesfm.digests import file_digest, model_digest, settings_text
 from snakesfm.errors import ConfigError
 from snakesfm.plan import Plan
 from snakesfm.records import split_words
@@ -177,6 +177,7 @@ def test_an_output_folder_with_braces_is_refused(tmp_path: Path, output: str) ->
 def params_of(config: dict[str, str]) -> dict[str, str]:
     """The params of every stage's job, of its first block or tile, as a new run has them."""
     file_digest.cache_clear()
+    model_digest.cache_clear()
     scene = Plan(config).scenes["scene"]
     parts = {"block": "0", "tile": "0-0"}
     return {stage: scene.params(stage, parts, True) for stage in STAGES}
@@ -226,3 +227,38 @@ def test_another_version_of_a_stage_changes_what_it_is_told(
 
 def test_settings_of_another_seed_are_others() -> None:
     assert settings_text({}, 1) == settings_text({"images": "elsewhere"}, 1) != settings_text({}, 2)
+
+
+@pytest.mark.parametrize("place", [".", "sparse", "sparse/0"])
+@pytest.mark.parametrize(
+    ("changed", "counts"),
+    [
+        ("cameras.bin", True),
+        ("points3D.bin", True),
+        ("frames.bin", True),
+        ("project.txt", False),
+        ("stereo/depth_maps/a.bin", False),
+    ],
+)
+def test_of_a_reference_only_the_files_of_its_model_count(
+    tmp_path: Path, place: str, changed: str, counts: bool
+) -> None:
+    folder = tmp_path / place
+    for name in ("cameras.bin", "images.bin", "points3D.bin", "rigs.bin", "frames.bin", changed):
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_bytes(b"content")
+    before = model_digest(str(tmp_path))
+    (folder / changed).write_bytes(b"Content")
+    model_digest.cache_clear()
+    assert (model_digest(str(tmp_path)) != before) == counts
+
+
+def test_of_a_folder_with_known_cameras_these_and_the_lists_beside_count(tmp_path: Path) -> None:
+    digests = []
+    for name in ("cameras.txt", "images.txt", "points3D.txt", "K.txt"):
+        (tmp_path / name).write_text(f"content of {name}")
+        file_digest.cache_clear()
+        digests.append(file_digest(str(tmp_path), "images.txt", "images.bin"))
+    assert len(set(digests[:2])) == 2 and digests[1] == digests[2] == digests[3]
+    assert file_digest(str(tmp_path / "cameras.txt"), "images.txt") == digests[1]
+    assert file_digest("") == model_digest("") == ""
