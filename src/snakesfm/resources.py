@@ -12,8 +12,8 @@ from dataclasses import dataclass
 AROUND_MB = 300
 # a busy file system and a slow start take minutes without any work
 START_MIN = 15
-# what needs were measured with, extract_features.max_shorter_side_px
-USUAL_SIDE_PX = 760
+# extract_features.max_shorter_side_px when needs were measured, which stays if its default changes
+MEASURED_SIDE_PX = 760
 # larger photographs are rare: who asks for more wants them as they are
 LARGEST_SIDE_PX = 6000
 
@@ -99,7 +99,7 @@ def job_load(
     pairs: int,
     networks: int = 0,
     batch: int = 1,
-    shorter_side_px: int = USUAL_SIDE_PX,
+    shorter_side_px: int = MEASURED_SIDE_PX,
 ) -> Load:
     """What one job of a stage works on, on average over the scene's blocks or tiles.
 
@@ -108,7 +108,7 @@ def job_load(
     grain = NEEDS[stage].grain
     if grain == "block":
         side = min(shorter_side_px, LARGEST_SIDE_PX)
-        area = (side / USUAL_SIDE_PX) ** 2 if NEEDS[stage].area_mb else 1.0
+        area = (side / MEASURED_SIDE_PX) ** 2 if NEEDS[stage].area_mb else 1.0
         return Load(images / blocks, 0, networks, batch, area)
     if grain == "tile":
         tiles = blocks * (blocks + 1) / 2

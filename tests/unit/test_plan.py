@@ -9,9 +9,10 @@ from hypothesis import strategies as st
 
 from snakesfm.blocks import choose_blocks, deal_blocks, tile_names
 from snakesfm.config.configuration import STAGES, options_class
-from snakesfm.digests import file_digest, settings_text
+from snakesfm.digests import file_digest, model_digest, settings_text
 from snakesfm.errors import ConfigError
 from snakesfm.plan import Plan
+from snakesfm.records import split_words
 from snakesfm.rule_inputs import global_descriptors, previewed_features
 from snakesfm.rule_settings import check_named_together
 from snakesfm.seeding import derive_seed
@@ -96,6 +97,27 @@ def test_small_scenes_are_exhaustive_and_large_ones_retrieve(tmp_path: Path) -> 
     assert previewed_features(learned.scenes["small"]) == []
 
 
+@pytest.mark.parametrize(
+    ("front_end", "method", "stages"),
+    [
+        ("sift", "retrieval", {"extract_features"}),
+        ("loftr", "retrieval", {"extract_features", "merge_keypoints"}),
+        ("loftr", "exhaustive", {"merge_keypoints"}),
+    ],
+)
+def test_keypoints_are_artifacts_wherever_they_are_made(
+    tmp_path: Path, front_end: str, method: str, stages: set[str]
+) -> None:
+    images = str(make_images(tmp_path / "scene", 5))
+    plan = plan_of(tmp_path, images=images, front_end=front_end, select_pairs={"method": method})
+    scene = plan.scenes["scene"]
+    files = scene.artifacts()
+    assert len(files) == len(set(files))
+    made = {Path(file).parent.name for file in files}
+    assert made & {"extract_features", "merge_keypoints"} == stages
+    assert all(set(scene.files(stage, "blocks")) <= set(files) for stage in stages)
+
+
 def test_params_are_canonical_and_follow_content_not_time(tmp_path: Path) -> None:
     folder = make_images(tmp_path / "scene", 3)
     first = plan_of(tmp_path, images=str(folder)).scenes["scene"].params("index_images", {}, True)
@@ -134,18 +156,20 @@ def test_scenes_of_other_sizes_have_rules_of_their_own(tmp_path: Path) -> None:
         ("--until select_pairs", True),
         ("--until=select_pairs", True),
         ("-R match_pairs select_pairs", True),
+        ("-kUselect_pairs", True),
         ("--until select_pairs select_pairs_2_blocks", False),
         ("--until match_pairs --set-resources select_pairs:mem_mb=10 --set-threads select_pairs=1", False),
         ("--until select_pairs_2_blocks", False),
     ],
 )
 def test_a_rule_is_named_with_its_twins_or_not_at_all(words: str, is_refused: bool) -> None:
+    said = split_words(words.split())
     if is_refused:
         with pytest.raises(ConfigError, match="say 'select_pairs select_pairs_2_blocks'"):
-            check_named_together(words.split(), "select_pairs", {"select_pairs_2_blocks"})
+            check_named_together(said, "select_pairs", {"select_pairs_2_blocks"})
     else:
-        check_named_together(words.split(), "select_pairs", {"select_pairs_2_blocks"})
-    check_named_together(words.split(), "select_pairs", set())
+        check_named_together(said, "select_pairs", {"select_pairs_2_blocks"})
+    check_named_together(said, "select_pairs", set())
 
 
 @pytest.mark.parametrize("output", ["{braces}", "a{b"])
@@ -158,6 +182,7 @@ def test_an_output_folder_with_braces_is_refused(tmp_path: Path, output: str) ->
 def params_of(config: dict[str, str]) -> dict[str, str]:
     """The params of every stage's job, of its first block or tile, as a new run has them."""
     file_digest.cache_clear()
+    model_digest.cache_clear()
     scene = Plan(config).scenes["scene"]
     parts = {"block": "0", "tile": "0-0"}
     return {stage: scene.params(stage, parts, True) for stage in STAGES}
@@ -339,3 +364,38 @@ def test_artifacts_are_known_again_where_everything_was_moved(tmp_path: Path, ke
 
     told = texts(before)
     assert texts(before.rename(tmp_path / "there")) == told
+
+
+@pytest.mark.parametrize("place", [".", "sparse", "sparse/0"])
+@pytest.mark.parametrize(
+    ("changed", "counts"),
+    [
+        ("cameras.bin", True),
+        ("points3D.bin", True),
+        ("frames.bin", True),
+        ("project.txt", False),
+        ("stereo/depth_maps/a.bin", False),
+    ],
+)
+def test_of_a_reference_only_the_files_of_its_model_count(
+    tmp_path: Path, place: str, changed: str, counts: bool
+) -> None:
+    folder = tmp_path / place
+    for name in ("cameras.bin", "images.bin", "points3D.bin", "rigs.bin", "frames.bin", changed):
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_bytes(b"content")
+    before = model_digest(str(tmp_path))
+    (folder / changed).write_bytes(b"Content")
+    model_digest.cache_clear()
+    assert (model_digest(str(tmp_path)) != before) == counts
+
+
+def test_of_a_folder_with_known_cameras_these_and_the_lists_beside_count(tmp_path: Path) -> None:
+    digests = []
+    for name in ("cameras.txt", "images.txt", "points3D.txt", "K.txt"):
+        (tmp_path / name).write_text(f"content of {name}")
+        file_digest.cache_clear()
+        digests.append(file_digest(str(tmp_path), "images.txt", "images.bin"))
+    assert len(set(digests[:2])) == 2 and digests[1] == digests[2] == digests[3]
+    assert file_digest(str(tmp_path / "cameras.txt"), "images.txt") == digests[1]
+    assert file_digest("") == model_digest("") == ""

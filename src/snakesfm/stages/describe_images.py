@@ -53,6 +53,7 @@ def _describe_pictures(job: StageJob, options: "DescribeImagesOptions") -> tuple
     descriptor = DESCRIPTORS[options.method](state=job.read_weights(options.method))
     side = descriptor.usual_side_px if options.longer_side_px == "auto" else options.longer_side_px
     described = np.zeros((len(image_ids), descriptor.size), np.float32)
+    unread = []
     progress = job.progress(len(image_ids), "images")
     for rows in in_batches([tuple(size) for size in index.sizes[image_ids].tolist()], job.network_batch()):
         pictures = {}
@@ -66,6 +67,11 @@ def _describe_pictures(job: StageJob, options: "DescribeImagesOptions") -> tuple
                 pictures[row] = pixels.rgb
             except ImageError as error:
                 print(f"warning: {error}")
+                unread.append(error)
         described[list(pictures)] = describe_batch(descriptor, list(pictures.values()), side)
         progress.step(len(rows))
+    if unread:
+        job.warn(
+            f"{len(unread)} of {len(image_ids)} images cannot be read and so resemble no other: {unread[0]}"
+        )
     return image_ids.astype(np.int32), described

@@ -86,6 +86,12 @@ def run(job: StageJob) -> None:
     _collect(index, rows, digests, ordered, finder).write(job.output, job.header)
     counts = [len(result.points) for result in ordered]
     reused = sum(digest in former for digest in digests)
+    bare = [name for name, count in zip(names, counts, strict=True) if count == 0]
+    if bare:
+        job.warn(
+            f"{len(bare)} of {len(rows)} images have no keypoints and cannot be registered, such as "
+            f"'{bare[0]}': the job's log says whether they could be read."
+        )
     masked = f", {len(masks)} of them with masks" if masks else ""
     print(
         f"{len(rows)} images ({reused} taken over){masked}, {sum(counts)} keypoints, "

@@ -14,15 +14,13 @@ from snakesfm.artifacts.pairs import PairCoordinates
 from snakesfm.errors import ImageError
 from snakesfm.features.extraction import sample_colors
 from snakesfm.geometry.detector_pixels import detector_scales, reduce_keypoints
+from snakesfm.geometry.detector_sides import USUAL_SIDE_PX
 from snakesfm.ingest.read import read_image
 from snakesfm.matching.merging import merge_coordinates
 from snakesfm.stages.job import StageJob
 
 if TYPE_CHECKING:
     from snakesfm.config.merge_keypoints import MergeKeypointsOptions
-
-# colours need no more pixels than this
-COLOR_SIDE_PX = 760
 
 
 def run(job: StageJob) -> None:
@@ -89,7 +87,8 @@ def _read_colors(path: Path, keypoints: Array) -> Array:
     if len(keypoints) == 0:
         return np.zeros((0, 3), np.uint8)
     try:
-        image = read_image(path, COLOR_SIDE_PX)
+        # colours need no more pixels
+        image = read_image(path, USUAL_SIDE_PX)
     except ImageError as error:
         print(f"warning: {error}")
         return np.zeros((len(keypoints), 3), np.uint8)
