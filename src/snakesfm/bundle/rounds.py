@@ -72,15 +72,16 @@ def adjust_rounds(
     if settings.rotations_first:
         mapper.round("rotations fixed", settings.thresholds_px[0] * 2, constant_rotations=True)
     for row, threshold in enumerate(settings.thresholds_px):
+        number = row + 1
         phase: Phase = "final" if row == last else "early"
         refining = sources if row == max(last - 1, 0) else ()
         # what completion adds is not refined, so it ends where refinement begins
         completing = bool(row) and settings.complete_tracks and (not sources or row < last)
         mapper.prepare(completing, refining)
-        mapper.round(f"round {row + 1}", threshold, phase)
-        if row == max(last - 1, 0) and mapper.widen_lenses():
+        mapper.round(f"round {number}", threshold, phase, number)
+        if row == max(last - 1, 0) and mapper.widen_lenses(number):
             mapper.prepare(completing, refining)
-            mapper.round(f"round {row + 1} with wider lenses", threshold, phase)
+            mapper.round(f"round {number} with wider lenses", threshold, phase, number)
     while settings.register_images and mapper.register():
         mapper.round("registration", settings.thresholds_px[-1], "final")
     if settings.refine_principal_points and settings.solver == "ceres":
@@ -119,12 +120,17 @@ class _Mapper:
         self.held_graph: pycolmap.CorrespondenceGraph | None = None
 
     def round(
-        self, name: str, threshold_px: float, phase: Phase = "early", constant_rotations: bool = False
+        self,
+        name: str,
+        threshold_px: float,
+        phase: Phase = "early",
+        number: int = 0,
+        constant_rotations: bool = False,
     ) -> None:
         """One pass of the solver and the filters after it; all but the last are coarse.
 
-        The first of several holds the distortion, which would make up for a wrong focal length. A camera
-        gone wild is held until the pass ends: the next one starts from better poses and points.
+        Early rounds of a low number hold the distortion, which would make up for a wrong focal length. A
+        camera gone wild is held until the pass ends: the next one starts from better poses and points.
         """
         settings = self.settings
         solving = replace(self.solving, constant_rotations=constant_rotations)
@@ -144,8 +150,7 @@ class _Mapper:
                 loss_scale_px=settings.early_loss_share * threshold_px,
                 # the few steps of a coarse pass cost less than these need to be prepared
                 inner_iterations=False,
-                refine_distortion=solving.refine_distortion
-                and len(self.records) + 1 >= settings.distortion_from_round,
+                refine_distortion=solving.refine_distortion and number >= settings.distortion_from_round,
             )
         drop_short_tracks(self.reconstruction, settings.min_track_length, settings.sparse_observations)
         before = {k: list(camera.params) for k, camera in self.reconstruction.cameras.items()}
@@ -182,10 +187,10 @@ class _Mapper:
             )
             source.release()
 
-    def widen_lenses(self) -> bool:
-        """Give cameras whose lens is not of their model a wider one; whether there were some."""
+    def widen_lenses(self, number: int) -> bool:
+        """After a round, give cameras whose lens is not of their model a wider one; whether some were."""
         settings = self.settings
-        told = len(self.records) >= settings.distortion_from_round
+        told = number >= settings.distortion_from_round
         if not settings.widen_lenses or not told or settings.solver != "ceres":
             return False
         solving = replace(
