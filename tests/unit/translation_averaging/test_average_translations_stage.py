@@ -123,7 +123,8 @@ def test_stage_writes_centers_and_residuals(tmp_path, method):
     assert np.isnan(result.edge_residuals_deg[off]).all()
     assert np.isfinite(result.edge_residuals_deg[~off]).all()
     assert not result.edge_used[off].any()
-    assert not result.edge_used[truth.edge_outliers].any() or truth.edge_outliers.sum() > 5
+    # six of them, each more than 17 degrees off
+    assert result.edge_used[truth.edge_outliers & ~off].mean() < 0.2
     assert result.edge_used[~off & ~truth.edge_outliers].mean() > 0.9
     assert np.median(result.ray_residuals_deg) < 0.15
 
