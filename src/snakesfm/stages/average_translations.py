@@ -1,5 +1,6 @@
 """Stage average_translations: camera centres from averaged rotations, the view graph and the tracks."""
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,7 +12,7 @@ from snakesfm.artifacts.pairs import KINDS, ViewGraph
 from snakesfm.errors import SceneError
 from snakesfm.geometry.camera import cameras_from_columns, undistort
 from snakesfm.stages.job import StageJob
-from snakesfm.translation_averaging.average import DOUBTFUL_SHARE, average_components
+from snakesfm.translation_averaging.average import DOUBTFUL_SHARE, PositioningSettings, average_components
 from snakesfm.translation_averaging.averagers import (
     GlobalPositioning,
     ScaleChain,
@@ -75,24 +76,8 @@ def run(job: StageJob) -> None:
         ray_tracks=tracks.part_ids[by_part][rows].astype(np.int64),
         rays=world_rays(rotations, images, normalized[rows]),
     )
-    limits = SupportLimits(
-        sigma_rad=float(np.radians(options.ray_sigma_deg)),
-        edge_rad=float(np.radians(options.max_edge_residual_deg)),
-        min_support=options.min_support,
-        min_ratio=options.min_support_ratio,
-        max_relative_sigma=options.max_relative_sigma,
-    )
-    result = average_components(
-        problem,
-        averaged.components,
-        _averager(options),
-        limits,
-        refine=options.refine,
-        rays_per_camera=options.rays_per_camera,
-        edge_weight=options.edge_weight,
-        restarts=options.restarts,
-        seed=job.seed_for("positions"),
-    )
+    settings = positioning_settings(options, job.seed_for("positions"))
+    result = average_components(problem, averaged.components, settings)
     placed = int(np.isfinite(result.centers[:, 0]).sum())
     if placed < 2:
         raise SceneError(
@@ -100,7 +85,7 @@ def run(job: StageJob) -> None:
             f"{len(tracks.offsets) - 1} tracks: add images from different positions with more overlap, or "
             "mask borders and captions that all images share."
         )
-    agreeing = np.count_nonzero(result.ray_residuals_rad < limits.ray_rad)
+    agreeing = np.count_nonzero(result.ray_residuals_rad < settings.limits.ray_rad)
     if agreeing < DOUBTFUL_SHARE * len(result.ray_residuals_rad):
         job.warn(DOUBTFUL.format(percent=100 * agreeing / len(result.ray_residuals_rad)))
     residuals = np.full(len(graph.pairs), np.nan)
@@ -118,23 +103,49 @@ def run(job: StageJob) -> None:
     ).write(job.output, job.header)
 
 
-def _averager(options: "AverageTranslationsOptions") -> TranslationAverager:
-    if options.method == "translation_recovery":
-        return TranslationRecovery(
-            rays_per_camera=options.recovery_rays_per_camera,
-            sigma=options.recovery_sigma,
-            reject_outliers=options.reject_outliers,
-            residual_rad=float(np.radians(options.max_edge_residual_deg)),
-            mfas_projections=options.mfas_projections,
-            mfas_weight=options.mfas_weight,
-        )
-    if options.method == "global_positioning":
-        return GlobalPositioning(
-            options.rays_per_camera, options.positioning_loss_scale, options.positioning_start
-        )
-    return ScaleChain(
-        options.rays_per_camera, float(np.radians(options.ray_sigma_deg)), options.max_relative_sigma
+def positioning_settings(options: "AverageTranslationsOptions", seed: int) -> PositioningSettings:
+    """What the options say."""
+    return PositioningSettings(
+        averager=translation_averager(options),
+        limits=SupportLimits(
+            sigma_rad=float(np.radians(options.ray_sigma_deg)),
+            edge_rad=float(np.radians(options.max_edge_residual_deg)),
+            min_support=options.min_support,
+            min_ratio=options.min_support_ratio,
+            max_relative_sigma=options.max_relative_sigma,
+        ),
+        refine=options.refine,
+        rays_per_camera=options.rays_per_camera,
+        edge_weight=options.edge_weight,
+        restarts=options.restarts,
+        restart=GlobalPositioning(options.rays_per_camera, options.positioning_loss_scale, start=None),
+        seed=seed,
     )
+
+
+def translation_averager(options: "AverageTranslationsOptions") -> TranslationAverager:
+    """The averager that the options name, and what it falls back to with the same options."""
+    recovery = TranslationRecovery(
+        rays_per_camera=options.recovery_rays_per_camera,
+        sigma=options.recovery_sigma,
+        reject_outliers=options.reject_outliers,
+        residual_rad=float(np.radians(options.max_edge_residual_deg)),
+        mfas_projections=options.mfas_projections,
+        mfas_weight=options.mfas_weight,
+        chain=None,
+    )
+    chain = ScaleChain(
+        rays_per_camera=options.rays_per_camera,
+        sigma_rad=float(np.radians(options.ray_sigma_deg)),
+        max_relative_sigma=options.max_relative_sigma,
+        fallback=recovery,
+    )
+    if options.method == "translation_recovery":
+        return replace(recovery, chain=chain)
+    if options.method == "global_positioning":
+        start = chain if options.positioning_start == "chain" else None
+        return GlobalPositioning(options.rays_per_camera, options.positioning_loss_scale, start)
+    return chain
 
 
 def _median(values: Array) -> float:

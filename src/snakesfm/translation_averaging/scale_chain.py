@@ -103,7 +103,7 @@ def epipolar_rad(
 def chain_centers(
     problem: PositioningProblem,
     scale_rad: float,
-    max_relative_sigma: float = 0.1,
+    max_relative_sigma: float,
     edges_per_camera: int = 8,
 ) -> Array:
     """Centres (N,3) from the baselines of the edges; NaN where an image hangs on no edge that has one.
