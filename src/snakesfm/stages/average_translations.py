@@ -1,5 +1,6 @@
 """Stage average_translations: camera centres from averaged rotations, the view graph and the tracks."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -10,7 +11,7 @@ from snakesfm.artifacts.images import CalibratedCameras, ImageIndex
 from snakesfm.artifacts.mapping import CameraCenters, CameraRotations, TrackTable
 from snakesfm.artifacts.pairs import KINDS, ViewGraph
 from snakesfm.errors import SceneError
-from snakesfm.geometry.camera import cameras_from_columns, undistort
+from snakesfm.geometry.camera import Camera, cameras_from_columns, undistort
 from snakesfm.stages.job import StageJob
 from snakesfm.translation_averaging.average import DOUBTFUL_SHARE, PositioningSettings, average_components
 from snakesfm.translation_averaging.averagers import (
@@ -52,55 +53,62 @@ def run(job: StageJob) -> None:
     graph = ViewGraph.read(job.path("graph"))
     averaged = CameraRotations.read(job.path("rotations"))
     tracks = TrackTable.read(job.path("tracks"))
-    rotations = averaged.rotations
-    turned = np.isfinite(rotations[:, 0, 0])
-
-    usable = (
-        (graph.labels == 0) & (averaged.labels == 0) & turned[graph.pairs[:, 0]] & turned[graph.pairs[:, 1]]
-    )
-    usable &= (graph.kinds != KINDS.index("rotation_only")) & np.isfinite(graph.translations[:, 0])
-    # a part that a look-alike joined to a track is a landmark of its own: positioning cannot throw out rays
-    by_part = np.argsort(tracks.part_ids, kind="stable")
-    image_ids, keypoints = tracks.image_ids[by_part], tracks.keypoints[by_part]
-    rows = turned[image_ids]
-    normalized = undistort(cameras, index.camera_ids, image_ids, keypoints)
-    rows &= np.isfinite(normalized.sum(axis=1))
-    pairs = graph.pairs[usable].astype(np.int64)
-    images = image_ids[rows].astype(np.int64)
-    problem = PositioningProblem(
-        image_count=len(index.names),
-        pairs=pairs,
-        directions=edge_directions(rotations, pairs, graph.translations[usable]),
-        sigmas_rad=direction_sigmas(graph.covariances[usable]),
-        ray_images=images,
-        ray_tracks=tracks.part_ids[by_part][rows].astype(np.int64),
-        rays=world_rays(rotations, images, normalized[rows]),
-    )
+    problem, usable = _problem(index, cameras, graph, averaged, tracks)
     settings = positioning_settings(options, job.seed_for("positions"))
     result = average_components(problem, averaged.components, settings)
     placed = int(np.isfinite(result.centers[:, 0]).sum())
     if placed < 2:
         raise SceneError(
-            f"Scene '{job.scene}': no two images could be positioned from {len(pairs)} image pairs and "
-            f"{len(tracks.offsets) - 1} tracks: add images from different positions with more overlap, or "
-            "mask borders and captions that all images share."
+            f"Scene '{job.scene}': no two images could be positioned from {len(problem.pairs)} image pairs "
+            f"and {len(tracks.offsets) - 1} tracks: add images from different positions with more overlap, "
+            "or mask borders and captions that all images share."
         )
-    agreeing = np.count_nonzero(result.ray_residuals_rad < settings.limits.ray_rad)
-    if agreeing < DOUBTFUL_SHARE * len(result.ray_residuals_rad):
-        job.warn(DOUBTFUL.format(percent=100 * agreeing / len(result.ray_residuals_rad)))
-    residuals = np.full(len(graph.pairs), np.nan)
-    residuals[usable] = np.degrees(result.edge_residuals_rad)
+    agreeing = result.ray_residuals_rad < settings.limits.ray_rad
+    if np.count_nonzero(agreeing) < DOUBTFUL_SHARE * len(agreeing):
+        job.warn(DOUBTFUL.format(percent=100 * np.mean(agreeing)))
+    edges_deg, rays_deg = np.full(len(graph.pairs), np.nan), np.degrees(result.ray_residuals_rad)
+    edges_deg[usable] = np.degrees(result.edge_residuals_rad)
+    turned = int(np.isfinite(averaged.rotations[:, 0, 0]).sum())
     print(
-        f"{placed} of {turned.sum()} images with a rotation are positioned; median residuals: edges "
-        f"{_median(residuals):.2f} deg, rays {_median(np.degrees(result.ray_residuals_rad)):.2f} deg"
+        f"{placed} of {turned} images with a rotation are positioned; median residuals: edges "
+        f"{_median(edges_deg):.2f} deg, rays {_median(rays_deg):.2f} deg"
     )
     CameraCenters(
         centers=result.centers,
-        edge_residuals_deg=residuals,
-        edge_used=residuals < options.max_edge_residual_deg,
+        edge_residuals_deg=edges_deg,
+        edge_used=edges_deg < options.max_edge_residual_deg,
         ray_track_ids=result.ray_tracks,
-        ray_residuals_deg=np.degrees(result.ray_residuals_rad),
+        ray_residuals_deg=rays_deg,
     ).write(job.output, job.header)
+
+
+def _problem(
+    index: ImageIndex,
+    cameras: Sequence[Camera],
+    graph: ViewGraph,
+    averaged: CameraRotations,
+    tracks: TrackTable,
+) -> tuple[PositioningProblem, Array]:
+    """What images with a rotation tell of their positions, and which edges (E,) bool take part."""
+    turned = np.isfinite(averaged.rotations[:, 0, 0])
+    usable = (graph.labels == 0) & (averaged.labels == 0) & turned[graph.pairs].all(axis=1)
+    usable &= (graph.kinds != KINDS.index("rotation_only")) & np.isfinite(graph.translations[:, 0])
+    # a part that a look-alike joined to a track is a landmark of its own: positioning cannot throw out rays
+    by_part = np.argsort(tracks.part_ids, kind="stable")
+    image_ids, keypoints = tracks.image_ids[by_part], tracks.keypoints[by_part]
+    normalized = undistort(cameras, index.camera_ids, image_ids, keypoints)
+    rows = turned[image_ids] & np.isfinite(normalized.sum(axis=1))
+    pairs, images = graph.pairs[usable].astype(np.int64), image_ids[rows].astype(np.int64)
+    problem = PositioningProblem(
+        image_count=len(index.names),
+        pairs=pairs,
+        directions=edge_directions(averaged.rotations, pairs, graph.translations[usable]),
+        sigmas_rad=direction_sigmas(graph.covariances[usable]),
+        ray_images=images,
+        ray_tracks=tracks.part_ids[by_part][rows].astype(np.int64),
+        rays=world_rays(averaged.rotations, images, normalized[rows]),
+    )
+    return problem, usable
 
 
 def positioning_settings(options: "AverageTranslationsOptions", seed: int) -> PositioningSettings:
