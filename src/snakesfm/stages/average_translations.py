@@ -76,8 +76,6 @@ def run(job: StageJob) -> None:
     CameraCenters(
         centers=result.centers,
         edge_residuals_deg=edges_deg,
-        edge_used=edges_deg < options.max_edge_residual_deg,
-        ray_track_ids=result.ray_tracks,
         ray_residuals_deg=rays_deg,
     ).write(job.output, job.header)
 

@@ -55,10 +55,8 @@ class AveragedCenters:
     """(N,3), NaN where there is none; the median edge is one unit long and the median centre the origin."""
     edge_residuals_rad: Array
     """(E) NaN where a centre is missing."""
-    ray_tracks: Array
-    """(Q) track of each ray that took part."""
     ray_residuals_rad: Array
-    """(Q)."""
+    """(Q) of the rays that took part."""
 
 
 def average_components(
@@ -75,9 +73,8 @@ def average_components(
         found = average_translations(part, settings)
         centers[mine] = found.centers[mine]
         edge_residuals[edges] = found.edge_residuals_rad
-        rays.append((found.ray_tracks, found.ray_residuals_rad))
-    tracks, residuals = (np.concatenate(column) for column in zip(*rays, strict=True))
-    return AveragedCenters(centers, edge_residuals, tracks, residuals)
+        rays.append(found.ray_residuals_rad)
+    return AveragedCenters(centers, edge_residuals, np.concatenate(rays))
 
 
 def average_translations(problem: PositioningProblem, settings: PositioningSettings) -> AveragedCenters:
@@ -92,7 +89,7 @@ def average_translations(problem: PositioningProblem, settings: PositioningSetti
     limits = settings.limits
     part = largest_part(problem)
     # what is worked out per track must cost as much as there are rays, not as the highest number tells
-    chosen, tracks = with_rays(part, settings.rays_per_camera).number_tracks()
+    chosen = with_rays(part, settings.rays_per_camera).number_tracks()[0]
     images = part.images()
     if len(images) < 2:
         centers = np.full((problem.image_count, 3), np.nan)
@@ -108,21 +105,19 @@ def average_translations(problem: PositioningProblem, settings: PositioningSetti
             few = settings.rays_per_camera
             many = max(few, min(MORE_RAYS * few, MOST_RAYS // len(images)))
             restart = replace(settings.restart, rays_per_camera=many)
-            more, more_tracks = with_rays(part, many).number_tracks()
-            whole, _ = part.number_tracks()
+            more, whole = with_rays(part, many).number_tracks()[0], part.number_tracks()[0]
             best = max(agreeing_share(whole, centers, limits), LEAST_SHARE)
             for start in range(settings.restarts):
                 other = _checked_positions(more, restart.position(part, settings.seed + start), settings)
                 share = agreeing_share(whole, other, limits)
                 if share > best:
-                    chosen, tracks, centers, best = more, more_tracks, other, share
+                    chosen, centers, best = more, other, share
     centers = normalize_gauge(part, centers)
     seen = chosen.select_rays(np.isfinite(centers[chosen.ray_images, 0]))
     points = _landmarks(seen, centers)
     return AveragedCenters(
         centers=centers,
         edge_residuals_rad=edge_angles_rad(problem, centers),
-        ray_tracks=tracks[seen.ray_tracks],
         ray_residuals_rad=angles_rad(seen, centers, points),
     )
 

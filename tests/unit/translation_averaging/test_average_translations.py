@@ -344,7 +344,6 @@ def test_whole_averaging_with_noise_and_outliers(layout):
     good = result.edge_residuals_rad[~truth.edge_outliers]
     assert np.degrees(np.median(good)) < 3.0
     assert np.degrees(np.median(result.ray_residuals_rad)) < 0.2
-    assert len(result.ray_tracks) == len(result.ray_residuals_rad)
 
 
 @pytest.mark.parametrize("seed", [1, 2])
@@ -452,8 +451,7 @@ def test_numbers_of_tracks_cost_nothing_and_change_nothing(method, tolerance):
     few, many = (average_translations(one, settings(method=method)) for one in (problem, high))
     np.testing.assert_allclose(many.centers, few.centers, rtol=0.0, atol=tolerance)
     np.testing.assert_allclose(many.ray_residuals_rad, few.ray_residuals_rad, rtol=0.0, atol=tolerance)
-    np.testing.assert_array_equal(many.ray_tracks, few.ray_tracks * 10**9 + 10**12)
-    assert np.isfinite(few.centers).all() and len(few.ray_tracks) > 500
+    assert np.isfinite(few.centers).all() and len(few.ray_residuals_rad) > 500
 
 
 def test_loss_scale_of_global_positioning_says_which_rays_count():
