@@ -19,9 +19,6 @@ from snakesfm.geometry.rotations import angle_between
 from snakesfm.image_names import match_names
 
 Metrics = dict[str, float | int | None]
-RELATIVE_THRESHOLDS_DEG = (1.0, 3.0, 5.0, 10.0, 20.0)
-GLOBAL_THRESHOLDS_DEG = (1.0, 2.5, 5.0, 10.0, 20.0)
-MIN_BASELINE_RATIO = 1e-6
 
 
 @dataclass(frozen=True)
@@ -75,9 +72,9 @@ class PoseEvaluation:
 def evaluate_poses(
     model: Poses,
     reference: Poses,
-    relative_thresholds_deg: Sequence[float] = RELATIVE_THRESHOLDS_DEG,
-    global_thresholds_deg: Sequence[float] = GLOBAL_THRESHOLDS_DEG,
-    min_baseline_ratio: float = MIN_BASELINE_RATIO,
+    relative_thresholds_deg: Sequence[float],
+    global_thresholds_deg: Sequence[float],
+    min_baseline_ratio: float,
 ) -> PoseEvaluation:
     """Compare a model's poses to reference poses.
 
