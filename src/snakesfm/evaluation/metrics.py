@@ -14,7 +14,7 @@ from snakesfm.evaluation.pose_errors import (
     pose_auc,
     relative_pose_errors,
 )
-from snakesfm.geometry.poses import center_of
+from snakesfm.geometry.poses import center_of, has_pose
 from snakesfm.geometry.rotations import angle_between
 from snakesfm.image_names import match_names
 
@@ -32,8 +32,7 @@ class Poses:
     @property
     def registered(self) -> Array:
         """Which images have a pose, (n,) bool."""
-        rotations, translations = np.isfinite(self.rotations), np.isfinite(self.translations)
-        return np.asarray(rotations.all(axis=(1, 2)) & translations.all(axis=1))
+        return has_pose(self.rotations, self.translations)
 
     @property
     def centers(self) -> Array:
