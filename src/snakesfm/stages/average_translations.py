@@ -13,7 +13,7 @@ from snakesfm.artifacts.pairs import KINDS, ViewGraph
 from snakesfm.errors import SceneError
 from snakesfm.geometry.camera import Camera, cameras_from_columns, undistort
 from snakesfm.stages.job import StageJob
-from snakesfm.translation_averaging.average import DOUBTFUL_SHARE, PositioningSettings, average_components
+from snakesfm.translation_averaging.average import DOUBTFUL_SHARE, PositioningSettings, position_components
 from snakesfm.translation_averaging.averagers import (
     GlobalPositioning,
     ScaleChain,
@@ -55,7 +55,7 @@ def run(job: StageJob) -> None:
     tracks = TrackTable.read(job.path("tracks"))
     problem, usable = _problem(index, cameras, graph, averaged, tracks)
     settings = positioning_settings(options, job.seed_for("positions"))
-    result = average_components(problem, averaged.components, settings)
+    result = position_components(problem, averaged.components, settings)
     placed = int(np.isfinite(result.centers[:, 0]).sum())
     if placed < 2:
         raise SceneError(

@@ -59,7 +59,7 @@ class AveragedCenters:
     """(Q) of the rays that took part."""
 
 
-def average_components(
+def position_components(
     problem: PositioningProblem, components: Array, settings: PositioningSettings
 ) -> AveragedCenters:
     """Position the cameras of each component (N,) of the images, -1 for none, in its own frame."""
