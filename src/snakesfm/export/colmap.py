@@ -9,14 +9,8 @@ from snakesfm.arrays import Array
 from snakesfm.geometry.camera import Camera
 from snakesfm.geometry.colmap_binding import pycolmap
 from snakesfm.geometry.colmap_writing import keypoints_of_observations, with_observations
-from snakesfm.geometry.poses import to_rigid3d
+from snakesfm.geometry.poses import has_pose, to_rigid3d
 from snakesfm.grouping import rows_of_each
-
-
-def registered_images(rotations: Array, translations: Array) -> Array:
-    """Rows (n,) of the images that have a pose."""
-    finite = np.isfinite(rotations).all(axis=(1, 2)) & np.isfinite(translations).all(axis=1)
-    return np.flatnonzero(finite)
 
 
 def build_reconstruction(
@@ -54,7 +48,7 @@ def build_reconstruction(
     ValueError : a point is observed by an image that is not registered.
     ConfigError : the installed pycolmap has binary files of another layout.
     """
-    registered = registered_images(rotations, translations)
+    registered = np.flatnonzero(has_pose(rotations, translations))
     if not np.isin(image_ids, registered).all():
         raise ValueError("points are observed by images without a pose")
     model = pycolmap.Reconstruction()

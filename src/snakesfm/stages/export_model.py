@@ -11,12 +11,7 @@ import numpy as np
 
 from snakesfm.artifacts import CalibratedCameras, ImageIndex, Reconstruction, temporary_folder
 from snakesfm.artifacts.gather import gather_image_columns
-from snakesfm.export.colmap import (
-    build_reconstruction,
-    other_model_sizes,
-    registered_images,
-    summarize,
-)
+from snakesfm.export.colmap import build_reconstruction, other_model_sizes, summarize
 from snakesfm.export.georeference import LEAST_IMAGES, Georeference, georeference
 from snakesfm.export.image_folder import place_images
 from snakesfm.export.nerfstudio import camera_warnings, transforms
@@ -24,7 +19,7 @@ from snakesfm.export.undistorted import undistorted_share, write_undistorted
 from snakesfm.geometry.camera import Camera, cameras_from_columns
 from snakesfm.geometry.earth import local_origin
 from snakesfm.geometry.lens_fit import MAX_MISFIT, fit_lenses
-from snakesfm.geometry.poses import center_of, to_camera, translation_of
+from snakesfm.geometry.poses import center_of, has_pose, to_camera, translation_of
 from snakesfm.ingest.masks import masks_as_large
 from snakesfm.stages.job import StageJob
 
@@ -108,7 +103,7 @@ def run(job: StageJob) -> None:
     model, place = _placed(job, index, adjusted.select_model(0))
     cameras = cameras_from_columns(model.camera_models, model.camera_sizes, model.camera_params)
     names = [str(name) for name in index.names]
-    registered = registered_images(model.rotations, model.translations)
+    registered = np.flatnonzero(has_pose(model.rotations, model.translations))
     warnings = _warnings(job, index, adjusted, model, place, cameras)
     given_masks = Path(job.settings["masks"]) if "masks" in job.settings else None
     of_image = {names[row]: cameras[index.camera_ids[row]] for row in registered}
@@ -148,7 +143,7 @@ def _warnings(
     cameras: list[Camera],
 ) -> list[str]:
     """What a user should know of the model, a sentence each."""
-    registered = registered_images(model.rotations, model.translations)
+    registered = np.flatnonzero(has_pose(model.rotations, model.translations))
     used = {row: cameras[row] for row in sorted({int(index.camera_ids[row]) for row in registered})}
     warnings = _camera_warnings(adjusted, used)
     warnings += _lens_warnings(model, cameras, index.camera_ids)

@@ -91,10 +91,10 @@ def write_index(
     return folder / "index.h5"
 
 
-def write_cameras(folder: Path) -> Path:
+def write_cameras(folder: Path, focal_sigma: tuple[float, float] = (0.0, 0.0)) -> Path:
     models, sizes, params, sources = cameras_to_columns([CAMERA, CAMERA])
     CalibratedCameras(
-        models, sizes, params, sources, np.zeros(2), np.zeros(2, int), np.zeros((0, 4), int), [OVERLAY]
+        models, sizes, params, sources, focal_sigma, np.zeros(2, int), np.zeros((0, 4), int), [OVERLAY]
     ).write(folder / "cameras.h5", HEADER)
     return folder / "cameras.h5"
 
@@ -641,7 +641,8 @@ def write_former_stages(folder: Path, problem: SyntheticProblem) -> dict[str, ob
     log = folder / "logs" / "match_pairs" / "0-0.log"
     log.parent.mkdir(parents=True)
     log.write_text(describe_cost("match_pairs", 0.0, 12.5, 12.0, 321.0) + "\n", "utf-8")
-    names = ("graph", "rotations", "tracks", "points", "index", "reconstruction")
+    write_cameras(folder, (0.02, np.nan))
+    names = ("cameras", "graph", "rotations", "tracks", "points", "index", "reconstruction")
     inputs: dict[str, object] = {name: str(folder / f"{name}.h5") for name in names}
     # of a run with more blocks
     (log.parent / "2-3.log").write_text(describe_cost("match_pairs", 0.0, 70.0, 7.0, 9.0) + "\n", "utf-8")
@@ -678,6 +679,7 @@ def test_report_says_what_happened_and_escapes_names(tmp_path, problem) -> None:
     lost = int((problem.pairs == LOST).any(axis=1).sum())
     assert f"None of its {lost} pairs was accepted: too few inliers ({lost})." in page
     assert "cycle_median" in page
+    assert "focal lengths: 2 given; median standard deviation 2.0 %" in page
     assert "12.5" in page and "82.5" not in page
     assert "relative pose AUC" in page
     assert page.count("<title>") >= 2 * 8
