@@ -26,6 +26,9 @@ AFFINE_DAMPING = 1e-3
 """Holds the affine part, relative to the weight of the shift, where a patch has little texture."""
 PATCHES_AT_ONCE = 256
 """Arrays over so many patches stay in a core's cache."""
+IMAGES_AT_ONCE = 16
+"""So many images are worked on in turn: even of large ones more are held."""
+NOTHING = np.zeros(0, np.int64)
 
 
 @dataclass(frozen=True)
@@ -72,6 +75,18 @@ class _Templates:
     patches: Array
     inverses: Array
     to_plane: Array
+
+    @classmethod
+    def at(cls, rows: Array, radius: int) -> "_Templates":
+        """None of them is present yet."""
+        count, side = len(rows), 2 * radius + 3
+        return cls(
+            rows,
+            np.zeros(count, dtype=bool),
+            np.zeros((count, side, side), dtype=np.float32),
+            np.zeros((count, 6, 6)),
+            np.zeros((count, 2, 2)),
+        )
 
 
 def choose_templates(directions: Array, sizes: Array, inside: Array, offsets: Array) -> Array:
@@ -125,23 +140,30 @@ def align_observations(
     Pixels (L,2), and which observations (L,) bool were aligned or are templates; the others did not move.
     """
     moved, aligned = pixels.copy(), np.zeros(len(images), dtype=bool)
-    usable = (templates != np.arange(len(images))) & inside & inside[templates]
+    usable = np.flatnonzero((templates != np.arange(len(images))) & inside & inside[templates])
+    cut = _Templates.at(np.unique(templates[usable]), settings.radius_px)
+    # an image is aligned as soon as all its templates are cut, when a sequence's images are still held
+    last = np.arange(int(images.max(initial=-1)) + 1)
+    np.maximum.at(last, images[usable], images[templates[usable]])
+    to_cut = dict(rows_of_each(images[cut.rows] // IMAGES_AT_ONCE))
+    to_align = dict(rows_of_each(last[images[usable]] // IMAGES_AT_ONCE))
+
+    def align(part: tuple[int, Array]) -> tuple[Array, Array]:
+        image, mine = part
+        chosen = np.searchsorted(cut.rows, templates[mine])
+        return _align_in_image(read_gray(image), pixels[mine], tangents[mine], cut, chosen, settings)
+
     # OpenCV and numpy run without Python's lock
     with ThreadPoolExecutor(settings.threads) as pool:
-        cut = _cut_templates(
-            pool, read_gray, images, pixels, tangents, np.unique(templates[usable]), settings.radius_px
-        )
-        aligned[cut.rows[cut.present]] = True
-        rows = np.flatnonzero(usable & aligned[templates])
-        parts = [(image, rows[mine]) for image, mine in rows_of_each(images[rows])]
-
-        def align(part: tuple[int, Array]) -> tuple[Array, Array]:
-            image, mine = part
-            chosen = np.searchsorted(cut.rows, templates[mine])
-            return _align_in_image(read_gray(image), pixels[mine], tangents[mine], cut, chosen, settings)
-
-        for (_, mine), found in zip(parts, pool.map(align, parts), strict=True):
-            moved[mine], aligned[mine] = found
+        for batch in sorted(to_cut.keys() | to_align.keys()):
+            own = to_cut.get(batch, NOTHING)
+            _cut_templates(pool, read_gray, images, pixels, tangents, cut, own)
+            aligned[cut.rows[own]] = cut.present[own]
+            rows = usable[to_align.get(batch, NOTHING)]
+            rows = rows[aligned[templates[rows]]]
+            parts = [(image, rows[mine]) for image, mine in rows_of_each(images[rows])]
+            for (_, mine), found in zip(parts, pool.map(align, parts), strict=True):
+                moved[mine], aligned[mine] = found
     return moved, aligned
 
 
@@ -151,35 +173,32 @@ def _cut_templates(
     images: Array,
     pixels: Array,
     tangents: Array,
-    rows: Array,
-    radius: int,
-) -> _Templates:
-    """The templates at some rows (K,) of the observations, with a border of a pixel for gradients."""
-    side = 2 * radius + 3
-    x, y = _grid(radius + 1)
-    patches = np.zeros((len(rows), side, side), dtype=np.float32)
-    scales = np.full((len(rows), 2), np.nan)
+    templates: _Templates,
+    which: Array,
+) -> None:
+    """Fill in some (k,) of the templates, with a border of a pixel for gradients."""
+    x, y = _grid(templates.patches.shape[1] // 2)
 
     def cut(part: tuple[int, Array]) -> None:
         image, mine = part
         read = read_gray(image)
-        if read is not None:
-            place = pixels[rows[mine]] / read.scale
-            gray = read.gray.astype(np.float32)
-            patches[mine] = _sample(gray, place[:, :1] + x, place[:, 1:] + y).reshape(-1, side, side)
-            scales[mine] = read.scale
+        if read is None:
+            return
+        rows = templates.rows[mine]
+        place = pixels[rows] / read.scale
+        patches = _sample(read.gray.astype(np.float32), place[:, :1] + x, place[:, 1:] + y)
+        templates.patches[mine] = patches.reshape(-1, *templates.patches.shape[1:])
+        templates.to_plane[mine] = _inverse(tangents[rows] / read.scale[:, None])
+        templates.present[mine] = True
 
+    def invert(part: Array) -> None:
+        templates.inverses[part] = _inverse_normals(templates.patches[part])
+
+    of_images = [(image, which[mine]) for image, mine in rows_of_each(images[templates.rows[which]])]
+    starts = range(0, len(which), PATCHES_AT_ONCE)
     # each image writes rows of its own
-    list(pool.map(cut, rows_of_each(images[rows])))
-    starts = range(0, len(rows), PATCHES_AT_ONCE)
-    inverses = pool.map(lambda k: _inverse_normals(patches[k : k + PATCHES_AT_ONCE]), starts)
-    return _Templates(
-        rows,
-        np.isfinite(scales[:, 0]),
-        patches,
-        np.concatenate([np.zeros((0, 6, 6)), *inverses]),
-        _inverse(tangents[rows] / scales[:, :, None]),
-    )
+    list(pool.map(cut, of_images))
+    list(pool.map(invert, [which[start : start + PATCHES_AT_ONCE] for start in starts]))
 
 
 def _grid(radius: int) -> tuple[Array, Array]:
