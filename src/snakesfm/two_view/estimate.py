@@ -1,6 +1,7 @@
 """The two-view geometry of one pair of images."""
 
 from dataclasses import dataclass
+from math import ceil
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -15,7 +16,7 @@ from snakesfm.two_view.estimators import ESTIMATORS, RobustPose
 from snakesfm.two_view.kinds import fit_homography, fit_rotation, planar_twins, transfer_errors_px
 from snakesfm.two_view.refinement import SIGMA_FLOOR_PX, RefinedPose, descend_sampson, refine_pose
 from snakesfm.two_view.sampson import Correspondences, cauchy_cost, sampson_errors_px
-from snakesfm.two_view.significance import significance_of
+from snakesfm.two_view.significance import expected_by_chance, significance_of
 
 if TYPE_CHECKING:
     from snakesfm.config.estimate_two_view import EstimateTwoViewOptions
@@ -97,7 +98,7 @@ def estimate_two_view_geometry(
     if _is_hopeless(points, robust, options):
         return _without_pose("too_few_inliers", len(matches))
     robust, refined, significance = _estimate(points, extent, robust, options, seed)
-    return _judge(points, matches, robust, refined, significance, options, seed)
+    return _judge(points, matches, extent, robust, refined, significance, options, seed)
 
 
 def _without_pose(rejection: str, match_count: int) -> TwoViewEstimate:
@@ -161,6 +162,7 @@ def _refined(
 def _judge(
     points: Correspondences,
     matches: Array,
+    extent: Array,
     robust: RobustPose,
     refined: RefinedPose,
     significance: float,
@@ -186,7 +188,8 @@ def _judge(
     elif significance < options.min_significance or len(rows) * ratio < options.min_support:
         rejection = "not_significant"
     else:
-        kind, ambiguous = _kind_of(inliers, refined, angle_deg, selection_px, options, seed)
+        by_chance = expected_by_chance(refined.errors_px, float(extent[0]), float(extent[1]), selection_px)
+        kind, ambiguous = _kind_of(inliers, by_chance, refined, angle_deg, selection_px, options, seed)
         if kind == "rotation_only":
             rotation, of_rotation = fit_rotation(inliers, rotation, 1.0, SIGMA_FLOOR_PX)
             covariance = np.eye(5) * DIRECTION_UNKNOWN_VARIANCE
@@ -236,6 +239,7 @@ def _same_pose(refined: RefinedPose, pose: tuple[Array, Array]) -> bool:
 
 def _kind_of(
     inliers: Correspondences,
+    by_chance: float,
     refined: RefinedPose,
     angle_deg: float,
     selection_px: float,
@@ -253,17 +257,23 @@ def _kind_of(
     kind = "planar" if explained >= needed else "general"
     if options.min_ambiguity_gap == 0 or explained < TWIN_PLANE_RATIO * len(inliers):
         return kind, False
-    gaps = [_gap_to(inliers, refined, twin, selection_px) for twin in planar_twins(H)]
+    gaps = [_gap_to(inliers, by_chance, refined, twin, selection_px) for twin in planar_twins(H)]
     return kind, min(gaps, default=np.inf) < options.min_ambiguity_gap
 
 
 def _gap_to(
     inliers: Correspondences,
+    by_chance: float,
     refined: RefinedPose,
     twin: tuple[Array, Array],
     selection_px: float,
 ) -> float:
-    """Log-likelihood of the inliers lost by another pose; infinite if it is no rival."""
+    """Log-likelihood of the inliers lost by another pose; infinite if it is no rival.
+
+    As many inliers as are expected ``by_chance``, rounded up, are left out, those farthest from the rival:
+    a mismatch that happens to lie on the own pose's epipolar line may be far from the rival's, and alone
+    would decide.
+    """
     scale = 2.0 * max(refined.sigma_px, TWIN_NOISE_FLOOR_PX)
     if _same_pose(refined, twin):
         return float("inf")
@@ -275,5 +285,7 @@ def _gap_to(
         return float("inf")
     if _agreeing(inliers, rival, refined.sigma_px, selection_px) < TWIN_INLIER_RATIO * len(inliers):
         return float("inf")
-    own = sampson_errors_px(inliers, refined.rotation, refined.translation)
-    return 2.0 * (cauchy_cost(sampson_errors_px(inliers, *rival), scale) - cauchy_cost(own, scale))
+    others = sampson_errors_px(inliers, *rival)
+    told = np.argsort(np.abs(others), kind="stable")[: max(len(inliers) - ceil(by_chance), 0)]
+    own = sampson_errors_px(inliers.take(told), refined.rotation, refined.translation)
+    return 2.0 * (cauchy_cost(others[told], scale) - cauchy_cost(own, scale))

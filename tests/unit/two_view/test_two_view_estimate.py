@@ -91,6 +91,18 @@ def test_plane_with_two_equal_poses_is_ambiguous(two_views: Views) -> None:
     assert estimate(views).rejection == "ambiguous"
 
 
+@pytest.mark.parametrize(("scene", "least", "most"), [("plane", 0, 2), ("step", 18, 20)])
+def test_a_mismatch_on_its_epipolar_line_does_not_tell_the_poses_of_a_plane_apart(
+    two_views: Views, scene: str, least: int, most: int
+) -> None:
+    found = [
+        estimate(two_views(seed=seed, scene=scene, count=400, outliers=160, toward=(0.9, 0.1, -0.5)))
+        for seed in range(20)
+    ]
+    assert {pair.rejection for pair in found} <= {"", "ambiguous"}
+    assert least <= sum(not pair.rejection for pair in found) <= most
+
+
 def test_turning_camera_is_recognised_and_its_direction_unknown(two_views: Views) -> None:
     views = two_views(seed=5, baseline=0.0)
     found = estimate(views)
