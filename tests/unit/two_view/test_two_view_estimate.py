@@ -11,6 +11,7 @@ from snakesfm.config.estimate_two_view import EstimateTwoViewOptions
 from snakesfm.geometry.rotations import angle_between, angle_of
 from snakesfm.two_view.correspondences import first_rows_at_place, unify_matches
 from snakesfm.two_view.estimate import TwoViewEstimate, _in_front, estimate_two_view_geometry
+from snakesfm.two_view.kinds import fit_homography, transfer_errors_px
 from snakesfm.two_view.sampson import Correspondences
 
 Views = Callable[..., Any]
@@ -111,6 +112,39 @@ def test_turning_camera_is_recognised_and_its_direction_unknown(two_views: Views
     assert 1e-6 < errors_deg(found, views)[0] < 0.05
     assert np.sqrt(found.covariance[3, 3]) > 1.0
     assert np.degrees(np.sqrt(np.trace(found.covariance[:3, :3]))) < 0.1
+
+
+@pytest.mark.parametrize("swapped", [False, True])
+def test_zooming_is_rotation_only_whichever_image_comes_first(two_views: Views, swapped: bool) -> None:
+    kinds = []
+    for seed in range(10):
+        views = two_views(seed=seed, baseline=0.0, focal_j=1800.0, outliers=30, noise_px=0.5)
+        if swapped:
+            views = replace(
+                views,
+                keypoints_i=views.keypoints_j,
+                keypoints_j=views.keypoints_i,
+                matches=views.matches[:, ::-1],
+                camera_i=views.camera_j,
+                camera_j=views.camera_i,
+            )
+        found = estimate(views)
+        assert found.rejection == ""
+        kinds.append(found.kind)
+    assert kinds == ["rotation_only"] * 10
+
+
+def test_transfer_errors_of_swapped_images_are_equal() -> None:
+    rng = np.random.default_rng(0)
+    rays = np.column_stack([rng.uniform(-0.3, 0.3, (2000, 2)), np.ones(2000)])
+    focals, noise = (900.0, 2700.0), [rng.normal(0, 0.5, (2000, 2)) for _ in range(2)]
+    seen = [rays + np.pad(n / f, ((0, 0), (0, 1))) for n, f in zip(noise, focals, strict=True)]
+    points, swapped = Correspondences(*seen, *focals), Correspondences(*seen[::-1], *focals[::-1])
+    errors = transfer_errors_px(points, np.eye(3))
+    np.testing.assert_allclose(transfer_errors_px(swapped, np.eye(3)), -errors, atol=1e-9)
+    assert 0.95 < errors.std() / (np.sqrt(2.0) * 0.5) < 1.05
+    for pair in (points, swapped):
+        assert 0.85 < fit_homography(pair, 1.5, 0)[1] / 2000 < 0.93
 
 
 def test_covariance_tells_the_error(two_views: Views) -> None:
