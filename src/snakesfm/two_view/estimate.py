@@ -8,7 +8,7 @@ import numpy as np
 
 from snakesfm.arrays import Array
 from snakesfm.geometry.camera import Camera
-from snakesfm.geometry.rotations import angle_between
+from snakesfm.geometry.rotations import angle_between, log_so3
 from snakesfm.two_view.bundle import inverse_depths
 from snakesfm.two_view.correspondences import correspond, unique_matches
 from snakesfm.two_view.covariance import DIRECTION_UNKNOWN_VARIANCE
@@ -25,6 +25,8 @@ THRESHOLD_SIGMAS = 3.0
 SELECTION_SIGMAS = 4.0
 REACH_FACTOR = 4.0
 HOPELESS_SHARE = 0.6
+# squared, in standard deviations of the pose with a direction
+MAX_BEND_SQUARED = 16.0
 TWIN_PLANE_RATIO = 0.4
 TWIN_START_RATIO = 0.5
 TWIN_INLIER_RATIO = 0.85
@@ -189,11 +191,16 @@ def _judge(
         rejection = "not_significant"
     else:
         by_chance = expected_by_chance(refined.errors_px, float(extent[0]), float(extent[1]), selection_px)
-        kind, ambiguous = _kind_of(inliers, by_chance, refined, angle_deg, selection_px, options, seed)
-        if kind == "rotation_only":
-            rotation, of_rotation = fit_rotation(inliers, rotation, 1.0, SIGMA_FLOOR_PX)
+        alone = None
+        if angle_deg < options.rotation_only_angle_deg:
+            alone = _rotation_alone(points, matches, rows, refined, selection_px, options)
+        if alone is not None:
+            kind, ambiguous = "rotation_only", False
+            rotation, of_rotation = alone
             covariance = np.eye(5) * DIRECTION_UNKNOWN_VARIANCE
             covariance[:3, :3] = of_rotation
+        else:
+            kind, ambiguous = _kind_of(inliers, by_chance, refined, selection_px, options, seed)
         worst = float(np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1]))
         if worst > np.radians(options.max_rotation_std_deg):
             rejection = "indeterminate"
@@ -237,24 +244,46 @@ def _same_pose(refined: RefinedPose, pose: tuple[Array, Array]) -> bool:
     return rotation_cos > TWIN_ROTATION_COS and direction_cos > TWIN_DIRECTION_COS
 
 
+def _rotation_alone(
+    points: Correspondences,
+    matches: Array,
+    inliers: Array,
+    refined: RefinedPose,
+    selection_px: float,
+    options: "EstimateTwoViewOptions",
+) -> tuple[Array, Array] | None:
+    """Rotation (3,3) and its covariance (3,3) in rad^2 if it explains the inliers alone, else None.
+
+    Parallax bends a rotation alone, far beyond its covariance. It must agree with the pose with a direction
+    under the covariance of that, and what their difference exceeds chance by is added to its own.
+    """
+    first, _ = fit_rotation(points.take(inliers), refined.rotation, 1.0, SIGMA_FLOOR_PX)
+    errors = np.linalg.norm(transfer_errors_px(points, first), axis=1)
+    if np.count_nonzero(errors[inliers] < selection_px) < options.planar_ratio * len(inliers):
+        return None
+    # inliers of the pose with a direction lie one way along their epipolar lines, and mismatches far along
+    rows = unique_matches(matches, errors, errors < selection_px)
+    rotation, covariance = fit_rotation(points.take(rows), first, 1.0, SIGMA_FLOOR_PX)
+    bend = log_so3(rotation @ refined.rotation.T)
+    squared = float(bend @ np.linalg.solve(refined.covariance[:3, :3], bend))
+    if squared > MAX_BEND_SQUARED:
+        return None
+    # by chance the square is as large as there are coordinates
+    excess = max(1.0 - len(bend) / max(squared, 1e-12), 0.0)
+    return rotation, covariance + excess * np.outer(bend, bend)
+
+
 def _kind_of(
     inliers: Correspondences,
     by_chance: float,
     refined: RefinedPose,
-    angle_deg: float,
     selection_px: float,
     options: "EstimateTwoViewOptions",
     seed: int,
 ) -> tuple[str, bool]:
-    """The kind of the pair, and whether another pose explains its one plane as well."""
-    needed = options.planar_ratio * len(inliers)
-    if angle_deg < options.rotation_only_angle_deg:
-        rotation, _ = fit_rotation(inliers, refined.rotation, 1.0, SIGMA_FLOOR_PX)
-        errors = np.linalg.norm(transfer_errors_px(inliers, rotation), axis=1)
-        if np.count_nonzero(errors < selection_px) >= needed:
-            return "rotation_only", False
+    """Whether the pair is planar or general, and whether another pose explains its one plane as well."""
     H, explained = fit_homography(inliers, selection_px, seed)
-    kind = "planar" if explained >= needed else "general"
+    kind = "planar" if explained >= options.planar_ratio * len(inliers) else "general"
     if options.min_ambiguity_gap == 0 or explained < TWIN_PLANE_RATIO * len(inliers):
         return kind, False
     gaps = [_gap_to(inliers, by_chance, refined, twin, selection_px) for twin in planar_twins(H)]

@@ -102,4 +102,4 @@ def fit_rotation(
         rotation = exp_so3(step) @ rotation
         if np.linalg.norm(step) < 1e-8:
             break
-    return rotation, invert_information(rows.T @ rows / cauchy_variance(errors.ravel(), scale, 3))
+    return rotation, invert_information(rows.T @ rows / cauchy_variance(errors, scale, 3))
