@@ -10,7 +10,7 @@ from snakesfm.config.base import StageOptions
 class EstimateTwoViewOptions(StageOptions):
     """How the relative pose of a pair is estimated, refined and accepted."""
 
-    stage_version: ClassVar[int] = 5
+    stage_version: ClassVar[int] = 6
 
     estimator: Literal["poselib", "opencv_gcransac", "opencv_magsac", "pycolmap"] = "poselib"
     """Robust estimator of the essential matrix."""

@@ -77,7 +77,8 @@ def relative_pose_errors(
     model_rotations = np.where(registered[:, None, None], rotations, np.eye(3))
     centers = center_of(model_rotations, np.where(registered[:, None], translations, 0.0))
     reference_centers = center_of(reference_rotations, reference_translations)
-    coincident = COINCIDENT_RATIO * float(np.linalg.norm(np.ptp(centers, axis=0))) if count else 0.0
+    extent = np.ptp(centers[registered], axis=0) if registered.any() else np.zeros(3)
+    coincident = COINCIDENT_RATIO * float(np.linalg.norm(extent))
     # |R_j R_i^T - R*_j R*_i^T| is |D_j - D_i| with D = R*^T R, so no pair needs a product.
     differences = np.swapaxes(reference_rotations, 1, 2) @ model_rotations
     compared = compared_images(count)

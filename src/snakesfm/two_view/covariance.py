@@ -18,12 +18,17 @@ def invert_information(information: Array) -> Array:
 def cauchy_variance(errors: Array, scale: float, parameters: int) -> float:
     """The factor that makes (J^T J)^-1 the covariance of an estimate by the Cauchy loss.
 
-    Source: Huber, Robust Statistics, section 7.6: sum(psi^2) / (M - P) / mean(psi')^2.
+    Parameters
+    ----------
+    errors : (M,) residuals, or (M,D) residual vectors whose length the loss takes.
+
+    Source: Huber, Robust Statistics, section 7.6: sum(psi^2) / (M - P) / mean(psi')^2, of all coordinates.
     """
-    u = (errors / scale) ** 2
-    influence = errors / (1.0 + u)
-    slope = (1.0 - u) / (1.0 + u) ** 2
-    spread = float(np.sum(influence**2)) / max(len(errors) - parameters, 1)
+    vectors = errors.reshape(len(errors), -1)
+    u = np.sum((vectors / scale) ** 2, axis=1)
+    weights = 1.0 / (1.0 + u)
+    slope = weights - 2.0 / vectors.shape[1] * u * weights**2
+    spread = float(np.sum((vectors * weights[:, None]) ** 2)) / max(vectors.size - parameters, 1)
     return spread / max(float(np.mean(slope)), 0.1) ** 2
 
 

@@ -1,13 +1,14 @@
 """The two-view geometry of one pair of images."""
 
 from dataclasses import dataclass
+from math import ceil
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from snakesfm.arrays import Array
 from snakesfm.geometry.camera import Camera
-from snakesfm.geometry.rotations import angle_between
+from snakesfm.geometry.rotations import angle_between, log_so3
 from snakesfm.two_view.bundle import inverse_depths
 from snakesfm.two_view.correspondences import correspond, unique_matches
 from snakesfm.two_view.covariance import DIRECTION_UNKNOWN_VARIANCE
@@ -15,7 +16,7 @@ from snakesfm.two_view.estimators import ESTIMATORS, RobustPose
 from snakesfm.two_view.kinds import fit_homography, fit_rotation, planar_twins, transfer_errors_px
 from snakesfm.two_view.refinement import SIGMA_FLOOR_PX, RefinedPose, descend_sampson, refine_pose
 from snakesfm.two_view.sampson import Correspondences, cauchy_cost, sampson_errors_px
-from snakesfm.two_view.significance import significance_of
+from snakesfm.two_view.significance import expected_by_chance, significance_of
 
 if TYPE_CHECKING:
     from snakesfm.config.estimate_two_view import EstimateTwoViewOptions
@@ -24,6 +25,8 @@ THRESHOLD_SIGMAS = 3.0
 SELECTION_SIGMAS = 4.0
 REACH_FACTOR = 4.0
 HOPELESS_SHARE = 0.6
+# squared, in standard deviations of the pose with a direction
+MAX_BEND_SQUARED = 16.0
 TWIN_PLANE_RATIO = 0.4
 TWIN_START_RATIO = 0.5
 TWIN_INLIER_RATIO = 0.85
@@ -97,7 +100,7 @@ def estimate_two_view_geometry(
     if _is_hopeless(points, robust, options):
         return _without_pose("too_few_inliers", len(matches))
     robust, refined, significance = _estimate(points, extent, robust, options, seed)
-    return _judge(points, matches, robust, refined, significance, options, seed)
+    return _judge(points, matches, extent, robust, refined, significance, options, seed)
 
 
 def _without_pose(rejection: str, match_count: int) -> TwoViewEstimate:
@@ -161,6 +164,7 @@ def _refined(
 def _judge(
     points: Correspondences,
     matches: Array,
+    extent: Array,
     robust: RobustPose,
     refined: RefinedPose,
     significance: float,
@@ -186,11 +190,17 @@ def _judge(
     elif significance < options.min_significance or len(rows) * ratio < options.min_support:
         rejection = "not_significant"
     else:
-        kind, ambiguous = _kind_of(inliers, refined, angle_deg, selection_px, options, seed)
-        if kind == "rotation_only":
-            rotation, of_rotation = fit_rotation(inliers, rotation, 1.0, SIGMA_FLOOR_PX)
+        by_chance = expected_by_chance(refined.errors_px, float(extent[0]), float(extent[1]), selection_px)
+        alone = None
+        if angle_deg < options.rotation_only_angle_deg:
+            alone = _rotation_alone(points, matches, rows, refined, selection_px, options)
+        if alone is not None:
+            kind, ambiguous = "rotation_only", False
+            rotation, of_rotation = alone
             covariance = np.eye(5) * DIRECTION_UNKNOWN_VARIANCE
             covariance[:3, :3] = of_rotation
+        else:
+            kind, ambiguous = _kind_of(inliers, by_chance, refined, selection_px, options, seed)
         worst = float(np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1]))
         if worst > np.radians(options.max_rotation_std_deg):
             rejection = "indeterminate"
@@ -234,36 +244,65 @@ def _same_pose(refined: RefinedPose, pose: tuple[Array, Array]) -> bool:
     return rotation_cos > TWIN_ROTATION_COS and direction_cos > TWIN_DIRECTION_COS
 
 
+def _rotation_alone(
+    points: Correspondences,
+    matches: Array,
+    inliers: Array,
+    refined: RefinedPose,
+    selection_px: float,
+    options: "EstimateTwoViewOptions",
+) -> tuple[Array, Array] | None:
+    """Rotation (3,3) and its covariance (3,3) in rad^2 if it explains the inliers alone, else None.
+
+    Parallax bends a rotation alone, far beyond its covariance. It must agree with the pose with a direction
+    under the covariance of that, and what their difference exceeds chance by is added to its own.
+    """
+    first, _ = fit_rotation(points.take(inliers), refined.rotation, 1.0, SIGMA_FLOOR_PX)
+    errors = np.linalg.norm(transfer_errors_px(points, first), axis=1)
+    if np.count_nonzero(errors[inliers] < selection_px) < options.planar_ratio * len(inliers):
+        return None
+    # inliers of the pose with a direction lie one way along their epipolar lines, and mismatches far along
+    rows = unique_matches(matches, errors, errors < selection_px)
+    rotation, covariance = fit_rotation(points.take(rows), first, 1.0, SIGMA_FLOOR_PX)
+    bend = log_so3(rotation @ refined.rotation.T)
+    squared = float(bend @ np.linalg.solve(refined.covariance[:3, :3], bend))
+    if squared > MAX_BEND_SQUARED:
+        return None
+    # by chance the square is as large as there are coordinates
+    excess = max(1.0 - len(bend) / max(squared, 1e-12), 0.0)
+    return rotation, covariance + excess * np.outer(bend, bend)
+
+
 def _kind_of(
     inliers: Correspondences,
+    by_chance: float,
     refined: RefinedPose,
-    angle_deg: float,
     selection_px: float,
     options: "EstimateTwoViewOptions",
     seed: int,
 ) -> tuple[str, bool]:
-    """The kind of the pair, and whether another pose explains its one plane as well."""
-    needed = options.planar_ratio * len(inliers)
-    if angle_deg < options.rotation_only_angle_deg:
-        rotation, _ = fit_rotation(inliers, refined.rotation, 1.0, SIGMA_FLOOR_PX)
-        errors = np.linalg.norm(transfer_errors_px(inliers, rotation), axis=1)
-        if np.count_nonzero(errors < selection_px) >= needed:
-            return "rotation_only", False
+    """Whether the pair is planar or general, and whether another pose explains its one plane as well."""
     H, explained = fit_homography(inliers, selection_px, seed)
-    kind = "planar" if explained >= needed else "general"
+    kind = "planar" if explained >= options.planar_ratio * len(inliers) else "general"
     if options.min_ambiguity_gap == 0 or explained < TWIN_PLANE_RATIO * len(inliers):
         return kind, False
-    gaps = [_gap_to(inliers, refined, twin, selection_px) for twin in planar_twins(H)]
+    gaps = [_gap_to(inliers, by_chance, refined, twin, selection_px) for twin in planar_twins(H)]
     return kind, min(gaps, default=np.inf) < options.min_ambiguity_gap
 
 
 def _gap_to(
     inliers: Correspondences,
+    by_chance: float,
     refined: RefinedPose,
     twin: tuple[Array, Array],
     selection_px: float,
 ) -> float:
-    """Log-likelihood of the inliers lost by another pose; infinite if it is no rival."""
+    """Log-likelihood of the inliers lost by another pose; infinite if it is no rival.
+
+    As many inliers as are expected ``by_chance``, rounded up, are left out, those farthest from the rival:
+    a mismatch that happens to lie on the own pose's epipolar line may be far from the rival's, and alone
+    would decide.
+    """
     scale = 2.0 * max(refined.sigma_px, TWIN_NOISE_FLOOR_PX)
     if _same_pose(refined, twin):
         return float("inf")
@@ -275,5 +314,7 @@ def _gap_to(
         return float("inf")
     if _agreeing(inliers, rival, refined.sigma_px, selection_px) < TWIN_INLIER_RATIO * len(inliers):
         return float("inf")
-    own = sampson_errors_px(inliers, refined.rotation, refined.translation)
-    return 2.0 * (cauchy_cost(sampson_errors_px(inliers, *rival), scale) - cauchy_cost(own, scale))
+    others = sampson_errors_px(inliers, *rival)
+    told = np.argsort(np.abs(others), kind="stable")[: max(len(inliers) - ceil(by_chance), 0)]
+    own = sampson_errors_px(inliers.take(told), refined.rotation, refined.translation)
+    return 2.0 * (cauchy_cost(others[told], scale) - cauchy_cost(own, scale))

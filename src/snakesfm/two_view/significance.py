@@ -29,7 +29,26 @@ def significance_of(errors_px: Array, width_px: float, height_px: float, floor_p
     log_factorials = np.concatenate([[0.0], np.cumsum(np.log(np.arange(1, count + 1)))])
     log_samples = log_factorials[agreeing] - log_factorials[sample] - log_factorials[agreeing - sample]
     log_subsets = log_factorials[count] - log_factorials[agreeing] - log_factorials[count - agreeing]
-    area = max(width_px * height_px, 1.0)
-    chance = np.minimum(1.0, 2.0 * ordered * np.hypot(width_px, height_px) / area)
+    chance = _chance_within(ordered, width_px, height_px)
     log_alarms = np.log(count - sample) + log_subsets + log_samples + (agreeing - sample) * np.log(chance)
     return max(0.0, -float(log_alarms.min()) / LOG10)
+
+
+def expected_by_chance(errors_px: Array, width_px: float, height_px: float, max_error_px: float) -> float:
+    """How many mismatches are expected within ``max_error_px`` of their epipolar lines.
+
+    Parameters
+    ----------
+    errors_px : (M,) signed distances of all matches to their epipolar lines; those beyond the limit are
+        taken for mismatches.
+    width_px, height_px : extent of the area over which the matched keypoints lie.
+    """
+    mismatches = np.count_nonzero(np.abs(errors_px) >= max_error_px)
+    return float(mismatches * _chance_within(np.array(max_error_px), width_px, height_px))
+
+
+def _chance_within(distances_px: Array, width_px: float, height_px: float) -> Array:
+    """The probabilities that a point anywhere in an area lies no farther from a line across it."""
+    area = max(width_px * height_px, 1.0)
+    chance: Array = np.minimum(1.0, 2.0 * distances_px * np.hypot(width_px, height_px) / area)
+    return chance

@@ -125,6 +125,20 @@ def test_equal_centres_have_no_direction_in_the_reference_and_fail_in_the_model_
     assert direction == pytest.approx([0.0, 0.0, 0.0, 180.0, 0.0, 180.0], abs=1e-6)
 
 
+def test_the_extent_of_a_model_is_that_of_its_registered_images() -> None:
+    rotations, centers = random_poses(4)
+    translations = translation_of(rotations, 1e-3 * centers + 5e6)
+    complete = relative_pose_errors(rotations, translations, rotations, translation_of(rotations, centers))
+    translations[0] = np.nan
+    _, direction = relative_pose_errors(
+        rotations, translations, rotations, translation_of(rotations, centers)
+    )
+    expected = complete[1].reshape(4, 3)
+    expected[0], expected[1:, 0] = 180.0, 180.0
+    assert direction.reshape(4, 3) == pytest.approx(expected, abs=1e-6)
+    assert 0.0 <= direction.reshape(4, 3)[1:, 1:].max() < 1e-3
+
+
 @pytest.mark.parametrize("count", [1, 2, 3, 20, 1000, 1001])
 def test_alignment_recovers_any_similarity_also_for_few_cameras(count) -> None:
     rotations, centers = random_poses(count)

@@ -32,14 +32,16 @@ def make_two_views(
     toward: tuple[float, float, float] = (0.9, 0.15, 0.3),
     focal_j: float = 900.0,
 ) -> TwoViews:
-    """Keypoints of a box or a plane seen by two cameras; outliers come last."""
+    """Keypoints of a box, a plane or one with a step, seen by two cameras; outliers come last."""
     rng = np.random.default_rng(seed)
     rotation = exp_so3(np.array([0.04, -0.12, 0.05]))
     direction = np.array(toward) / np.linalg.norm(toward)
     cameras = [Camera("SIMPLE_RADIAL", 1000, 800, (focal, 500.0, 400.0, 0.0)) for focal in (900.0, focal_j)]
     world = rng.uniform([-2, -1.5, 4], [2, 1.5, 9], (count, 3))
-    if scene == "plane":
+    if scene in ("plane", "step"):
         world[:, 2] = 6.0 + 0.4 * world[:, 0] - 0.3 * world[:, 1]
+    if scene == "step":
+        world[: count // 10, 2] -= 1.0
     local = world @ rotation.T + baseline * direction
     keypoints = []
     for points, camera in ((world, cameras[0]), (local, cameras[1])):
