@@ -21,6 +21,21 @@ MINIMAL_SAMPLE = 3
 LEAST_INLIERS = 0.5
 # positions must spread so many times farther than they err, in two directions, to tell the similarity
 LEAST_SPREAD = 10.0
+# of the spread along a line: less across it is a line
+LINE_RATIO = 0.05
+# half of what a model upside down has at least, be it of nadir, oblique or street-level photographs
+UPSIDE_DOWN = 0.5
+
+UPSIDE_DOWN_REASON = (
+    "they would turn the model upside down, as positions in a wrong hemisphere do: correct GPSLatitudeRef "
+    "(N or S) and GPSLongitudeRef (E or W), without which positions count as north and east"
+)
+DISAGREE_REASON = "only {inliers} of {images} agree with the model"
+LINE_REASON = "they lie on one line, about which the model could turn: photograph from several lines"
+SPREAD_REASON = (
+    "they spread over only {longer:.3g} by {shorter:.3g} m (standard deviations), at least one less than "
+    "ten times their median residual of {residual:.2g} m"
+)
 
 
 @dataclass(frozen=True)
@@ -35,6 +50,7 @@ class Georeference:
     median_residual_m : between the inliers' positions and EXIF's.
     spread_m : standard deviations (3,) of the inliers' positions in EXIF along their principal axes, the
         largest first; a wrong position beside a straight flight would make it look broad.
+    upward : mean over these images of the upward part of ``downward_axes``, about -1 if upright.
     """
 
     origin: Origin
@@ -43,14 +59,25 @@ class Georeference:
     inliers: int
     median_residual_m: float
     spread_m: tuple[float, float, float]
+    upward: float
+
+    @property
+    def refusal(self) -> str:
+        """Why these positions do not tell where the model is, a clause; empty where they do."""
+        longer, shorter, _ = self.spread_m
+        if self.inliers < max(LEAST_IMAGES, LEAST_INLIERS * self.images):
+            return DISAGREE_REASON.format(inliers=self.inliers, images=self.images)
+        if shorter < LEAST_SPREAD * self.median_residual_m:
+            if shorter < LINE_RATIO * longer:
+                return LINE_REASON
+            return SPREAD_REASON.format(longer=longer, shorter=shorter, residual=self.median_residual_m)
+        # positions mirrored by a wrong hemisphere fit cameras in a plane just as well, turned over
+        return UPSIDE_DOWN_REASON if self.upward > UPSIDE_DOWN else ""
 
     @property
     def trusted(self) -> bool:
-        """Whether positions agree with the model and are not on one line, about which it could turn."""
-        return (
-            self.inliers >= max(LEAST_IMAGES, LEAST_INLIERS * self.images)
-            and self.spread_m[1] >= LEAST_SPREAD * self.median_residual_m
-        )
+        """Whether positions agree with the model, spread in two directions and leave it upright."""
+        return not self.refusal
 
     def summary(self) -> dict[str, Any]:
         """What summary.json says."""
@@ -63,12 +90,31 @@ class Georeference:
         }
 
 
-def georeference(centers: Array, gps: Array, origin: Origin, seed: int) -> Georeference | None:
+def downward_axes(rotations: Array, orientations: Array) -> Array:
+    """What points down in photographs (N,3): the view direction plus the way to the lower side.
+
+    One of the two may be level, as in street-level and in nadir photographs, but not both.
+
+    Parameters
+    ----------
+    rotations : (N,3,3) cam_from_world, NaN where not registered.
+    orientations : (N,) EXIF orientations 1..8, which tell the lower side of the pixels as stored.
+    """
+    axes = np.where(orientations >= 5, 0, 1)
+    signs = np.where(np.isin(orientations, (3, 4, 7, 8)), -1.0, 1.0)
+    down: Array = rotations[:, 2] + signs[:, None] * rotations[np.arange(len(rotations)), axes]
+    return down
+
+
+def georeference(
+    centers: Array, downward: Array, gps: Array, origin: Origin, seed: int
+) -> Georeference | None:
     """The similarity that takes camera centres to the positions in EXIF, or None where too few have one.
 
     Parameters
     ----------
     centers : (N,3) camera centres in the model's world, NaN where not registered.
+    downward : (N,3) of ``downward_axes``.
     gps : (N,3) latitude and longitude in degrees, altitude in metres; NaN where unknown.
     origin : of the local world.
     seed : of the random draws.
@@ -104,4 +150,5 @@ def georeference(centers: Array, gps: Array, origin: Origin, seed: int) -> Geore
         int(inliers.sum()),
         float(np.median(residuals[inliers])),
         (float(spread[0]), float(spread[1]), float(spread[2])),
+        float(np.mean(downward[known] @ found.rotation[2])),
     )

@@ -16,7 +16,7 @@ from snakesfm.export.colmap import (
     registered_images,
     summarize,
 )
-from snakesfm.export.georeference import LEAST_IMAGES, Georeference, georeference
+from snakesfm.export.georeference import LEAST_IMAGES, Georeference, downward_axes, georeference
 from snakesfm.export.image_folder import place_images
 from snakesfm.export.nerfstudio import camera_warnings, transforms
 from snakesfm.export.undistorted import undistorted_share, write_undistorted
@@ -93,9 +93,10 @@ NO_ALTITUDE = (
 )
 
 UNTRUSTED_PLACE = (
-    "georeference is true, but the GPS positions in EXIF do not determine it reliably: only {inliers} of "
-    "{images} agree with the model, or they lie on one line."
+    "georeference is true, but the GPS positions in EXIF do not determine it reliably: {reason}."
 )
+
+UNUSED_PLACE = "The model is not georeferenced by the GPS positions in EXIF: {reason}."
 
 COPIES = "{count} images are exact copies of others and are left out; the originals are used."
 
@@ -124,7 +125,8 @@ def run(job: StageJob) -> None:
         )
         _write_json(temporary / "transforms.json", content)
         summary = summarize(job.scene, names, adjusted.models, model.offsets, model.errors_px, warnings)
-        _write_json(temporary / SUMMARY, {**summary, "georeference": place and place.summary()})
+        told = place.summary() if place and (place.trusted or job.options.georeference is True) else None
+        _write_json(temporary / SUMMARY, {**summary, "georeference": told})
         _place_pictures(job, folder, names, index.orientations, masks)
         if job.options.undistort:
             write_undistorted(
@@ -212,7 +214,9 @@ def _cut_warnings(cameras: dict[int, Camera]) -> list[str]:
 def _place_warnings(place: Georeference | None, is_wanted: bool, gps: np.ndarray) -> list[str]:
     """Why there is no place though one is wanted, or none to rely on; ``gps`` is of registered images."""
     if place is not None:
-        return [] if place.trusted else [UNTRUSTED_PLACE.format(inliers=place.inliers, images=place.images)]
+        if place.trusted:
+            return []
+        return [(UNTRUSTED_PLACE if is_wanted else UNUSED_PLACE).format(reason=place.refusal)]
     if not is_wanted:
         return []
     known = np.isfinite(gps)
@@ -236,15 +240,19 @@ def _masks(folder: Path | None, cameras: dict[str, Camera], warnings: list[str])
 def _placed(
     job: StageJob, index: ImageIndex, model: Reconstruction
 ) -> tuple[Reconstruction, Georeference | None]:
-    """The model in metres east, north and up where EXIF tells where that is, and how well it does."""
+    """The model in metres east, north and up where EXIF tells where that is, and how well it does.
+
+    The model is as it was where the place that is found is not trusted.
+    """
     wanted = job.options.georeference
     origin = local_origin(index.gps) if wanted else None
     if origin is None:
         return model, None
     centers = center_of(model.rotations, model.translations)
-    place = georeference(centers, index.gps, origin, job.seed_for("georeference"))
+    downward = downward_axes(model.rotations, index.orientations)
+    place = georeference(centers, downward, index.gps, origin, job.seed_for("georeference"))
     if place is None or not (place.trusted or wanted is True):
-        return model, None
+        return model, place
     move = place.local_from_model
     rotations = move.transform_rotations(model.rotations)
     translations = translation_of(rotations, move.transform_points(centers))
