@@ -11,10 +11,13 @@ from snakesfm.geometry.earth import Origin, local_metres
 from snakesfm.geometry.poses import Similarity
 from snakesfm.geometry.robust import robust_sigma
 
-# what satellite navigation without corrections errs by at worst, height included
-COARSE_ERROR_M = 20.0
+# the first is what satellite navigation without corrections errs by at worst, height included; within the
+# others, a majority of good positions is told from others that err alike, as of a receiver that froze
+ERRORS_M = (20.0, 10.0, 5.0, 2.5, 1.2)
 # of a robust standard deviation: what counts as an inlier once the noise is measured
 INLIER_SIGMAS = 3.0
+# by least squares over the inliers, which settle after two or three
+REFITS = 5
 LEAST_IMAGES = 4
 # of which a similarity is estimated
 MINIMAL_SAMPLE = 3
@@ -119,30 +122,20 @@ def georeference(
     origin : of the local world.
     seed : of the random draws.
 
-    A first estimate allows for what plain satellite navigation errs; a second for what this one shows.
+    Of estimates that allow for several errors, the nearest to half of the positions shows how far they err;
+    least squares over those within just that follow.
     """
     known = np.isfinite(gps).all(axis=1) & np.isfinite(centers).all(axis=1)
     if known.sum() < LEAST_IMAGES:
         return None
     places = local_metres(gps[known], origin)
-    sources, max_error = centers[known], COARSE_ERROR_M
-    found = None
-    for _ in range(2):
-        options = pycolmap.RANSACOptions(max_error=max_error, random_seed=seed, max_num_trials=2000)
-        estimate = pycolmap.estimate_sim3d_robust(sources, places, options)
-        if estimate is None:
-            break
-        similarity = estimate["tgt_from_src"]
-        found = Similarity(
-            float(similarity.scale), similarity.rotation.matrix(), np.asarray(similarity.translation)
-        )
-        residuals = np.linalg.norm(found.transform_points(sources) - places, axis=1)
-        inliers = residuals <= max_error
-        max_error = min(max(INLIER_SIGMAS * robust_sigma(residuals, 0.0), 1e-6), COARSE_ERROR_M)
-    if found is None or inliers.sum() < MINIMAL_SAMPLE:
+    fit = _fit(centers[known], places, seed)
+    if fit is None:
         return None
-    places = places[inliers]
-    spread = np.linalg.svd(places - places.mean(axis=0), compute_uv=False) / np.sqrt(len(places))
+    found, residuals, inliers = fit
+    spread = np.linalg.svd(places[inliers] - places[inliers].mean(axis=0), compute_uv=False) / np.sqrt(
+        inliers.sum()
+    )
     return Georeference(
         origin,
         found,
@@ -152,3 +145,46 @@ def georeference(
         (float(spread[0]), float(spread[1]), float(spread[2])),
         float(np.mean(downward[known] @ found.rotation[2])),
     )
+
+
+def _fit(sources: Array, places: Array, seed: int) -> tuple[Similarity, Array, Array] | None:
+    """The similarity, the distances (n,) in metres that it leaves, and which of them are of inliers."""
+    estimates = (_estimate(sources, places, error, seed) for error in ERRORS_M)
+    found = min(
+        filter(None, estimates), key=lambda each: np.median(_residuals(each, sources, places)), default=None
+    )
+    for _ in range(REFITS):
+        if found is None:
+            return None
+        residuals = _residuals(found, sources, places)
+        inliers = residuals <= _max_error(residuals)
+        if inliers.sum() < MINIMAL_SAMPLE:
+            return None
+        found = _to_similarity(pycolmap.estimate_sim3d(sources[inliers], places[inliers]))
+    if found is None:
+        return None
+    residuals = _residuals(found, sources, places)
+    return found, residuals, residuals <= _max_error(residuals)
+
+
+def _estimate(sources: Array, places: Array, max_error_m: float, seed: int) -> Similarity | None:
+    """The similarity that most positions agree with."""
+    options = pycolmap.RANSACOptions(max_error=max_error_m, random_seed=seed, max_num_trials=2000)
+    estimate = pycolmap.estimate_sim3d_robust(sources, places, options)
+    return None if estimate is None else _to_similarity(estimate["tgt_from_src"])
+
+
+def _to_similarity(found: pycolmap.Sim3d | None) -> Similarity | None:
+    if found is None:
+        return None
+    return Similarity(float(found.scale), found.rotation.matrix(), np.asarray(found.translation))
+
+
+def _residuals(found: Similarity, sources: Array, places: Array) -> Array:
+    distances: Array = np.linalg.norm(found.transform_points(sources) - places, axis=1)
+    return distances
+
+
+def _max_error(residuals: Array) -> float:
+    """What an inlier errs by at most, in metres, from all residuals."""
+    return min(max(INLIER_SIGMAS * robust_sigma(residuals, 0.0), 1e-6), ERRORS_M[0])

@@ -148,3 +148,22 @@ def test_positions_in_the_wrong_hemisphere_do_not_turn_a_model_upside_down(kind,
         wrong = place(centers, mirrored, local_origin(mirrored), 0, rotations, orientations)
         assert wrong.inliers >= 60 and 0.8 < wrong.upward < 1.5
         assert not wrong.trusted and "GPSLongitudeRef" in wrong.refusal
+
+
+@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("scattered", [True, False])
+def test_a_majority_of_good_positions_is_told_from_a_receiver_that_froze(scattered, seed):
+    rng = np.random.default_rng(seed)
+    x, y = np.meshgrid(25.0 * np.arange(10), 30.0 * np.arange(8))
+    local = np.column_stack([x.ravel(), y.ravel(), np.zeros(80)]) + rng.normal(size=(80, 3)) * 0.3
+    turn = project_to_so3(rng.normal(size=(3, 3)))
+    noisy = local + rng.normal(size=local.shape) * 0.5
+    # towards the end, the good positions cover only a part
+    frozen = rng.permutation(80)[:30] if scattered else np.arange(50, 80)
+    noisy[frozen] = noisy[frozen[0]]
+    gps = pycolmap.GPSTransform().enu_to_ellipsoid(noisy, *ORIGIN)
+    found = place(0.1 * local @ turn, gps, local_origin(gps), 0)
+    assert found.trusted and 49 <= found.inliers <= 53
+    assert 0.4 < found.median_residual_m < 1.5
+    np.testing.assert_allclose(found.local_from_model.rotation @ turn.T, np.eye(3), atol=0.02)
+    np.testing.assert_allclose(found.local_from_model.scale, 10.0, rtol=0.01)
