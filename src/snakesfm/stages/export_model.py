@@ -16,7 +16,13 @@ from snakesfm.export.colmap import (
     registered_images,
     summarize,
 )
-from snakesfm.export.georeference import LEAST_IMAGES, Georeference, downward_axes, georeference
+from snakesfm.export.georeference import (
+    LEAST_IMAGES,
+    Georeference,
+    downward_axes,
+    georeference,
+    taking_order,
+)
 from snakesfm.export.image_folder import place_images
 from snakesfm.export.nerfstudio import camera_warnings, transforms
 from snakesfm.export.undistorted import undistorted_share, write_undistorted
@@ -125,7 +131,9 @@ def run(job: StageJob) -> None:
         )
         _write_json(temporary / "transforms.json", content)
         summary = summarize(job.scene, names, adjusted.models, model.offsets, model.errors_px, warnings)
-        told = place.summary() if place and (place.trusted or job.options.georeference is True) else None
+        told = (
+            place.summary(names) if place and (place.trusted or job.options.georeference is True) else None
+        )
         _write_json(temporary / SUMMARY, {**summary, "georeference": told})
         _place_pictures(job, folder, names, index.orientations, masks)
         if job.options.undistort:
@@ -148,6 +156,7 @@ def _warnings(
     cameras: list[Camera],
 ) -> list[str]:
     """What a user should know of the model, a sentence each."""
+    names = [str(name) for name in index.names]
     registered = registered_images(model.rotations, model.translations)
     used = {row: cameras[row] for row in sorted({int(index.camera_ids[row]) for row in registered})}
     warnings = _camera_warnings(adjusted, used)
@@ -156,7 +165,7 @@ def _warnings(
         warnings += _cut_warnings(used)
     if len({camera.is_fisheye for camera in used.values()}) > 1:
         warnings.append(MIXED_LENSES)
-    if any(" " in str(index.names[row]) for row in registered):
+    if any(" " in names[row] for row in registered):
         warnings.append(SPACES)
     others = other_model_sizes(adjusted.models)
     if others:
@@ -165,7 +174,7 @@ def _warnings(
         warnings.append(REFUSED.format(count=len(index.refused_names), first=index.refused_reasons[0]))
     warnings += [str(line) for line in index.warnings]
     warnings += [str(line) for line in CalibratedCameras.read(job.path("cameras")).warnings]
-    warnings += _place_warnings(place, job.options.georeference is True, index.gps[registered])
+    warnings += _place_warnings(place, names, job.options.georeference is True, index.gps[registered])
     copies = int(np.count_nonzero(index.duplicate_of >= 0))
     return warnings + ([COPIES.format(count=copies)] if copies else [])
 
@@ -211,12 +220,17 @@ def _cut_warnings(cameras: dict[int, Camera]) -> list[str]:
     ]
 
 
-def _place_warnings(place: Georeference | None, is_wanted: bool, gps: np.ndarray) -> list[str]:
+def _place_warnings(
+    place: Georeference | None, names: list[str], is_wanted: bool, gps: np.ndarray
+) -> list[str]:
     """Why there is no place though one is wanted, or none to rely on; ``gps`` is of registered images."""
     if place is not None:
+        steps = place.step_warnings(names)
         if place.trusted:
-            return []
-        return [(UNTRUSTED_PLACE if is_wanted else UNUSED_PLACE).format(reason=place.refusal)]
+            return steps
+        if is_wanted:
+            return [*steps, UNTRUSTED_PLACE.format(reason=place.refusal)]
+        return [UNUSED_PLACE.format(reason=place.refusal)]
     if not is_wanted:
         return []
     known = np.isfinite(gps)
@@ -250,7 +264,8 @@ def _placed(
         return model, None
     centers = center_of(model.rotations, model.translations)
     downward = downward_axes(model.rotations, index.orientations)
-    place = georeference(centers, downward, index.gps, origin, job.seed_for("georeference"))
+    order = taking_order([str(name) for name in index.names])
+    place = georeference(centers, downward, index.gps, origin, order, job.seed_for("georeference"))
     if place is None or not (place.trusted or wanted is True):
         return model, place
     move = place.local_from_model

@@ -23,7 +23,7 @@ def place(centers, gps, origin, seed, rotations=None, orientations=None) -> Geor
     else:
         ones = np.ones(len(centers), np.int32)
         downward = downward_axes(rotations, ones if orientations is None else orientations)
-    return georeference(centers, downward, gps, origin, seed)
+    return georeference(centers, downward, gps, origin, np.arange(len(centers)), seed)
 
 
 def survey(count: int = 60, noise_m: float = 1.5, shape: tuple[float, ...] = (200.0, 100.0, 10.0)):
