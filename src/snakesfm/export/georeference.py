@@ -36,16 +36,18 @@ LINE_RATIO = 0.05
 UPSIDE_DOWN = 0.5
 
 UPSIDE_DOWN_REASON = (
-    "they would turn the model upside down, as positions in a wrong hemisphere do: correct GPSLatitudeRef "
-    "(N or S) and GPSLongitudeRef (E or W), without which positions count as north and east"
+    "the positions would turn the model upside down, as those in a wrong hemisphere do: correct "
+    "GPSLatitudeRef (N or S) and GPSLongitudeRef (E or W), without which they count as north and east"
 )
-DISAGREE_REASON = "only {inliers} of {images} agree with the model"
-LINE_REASON = "they lie on one line, about which the model could turn: photograph from several lines"
+DISAGREE_REASON = "only {inliers} of {images} positions agree with the model"
+LINE_REASON = (
+    "the positions lie on one line, about which the model could turn: photograph from several lines"
+)
 SPREAD_REASON = (
-    "they spread over only {longer:.3g} by {shorter:.3g} m (standard deviations), at least one less than "
-    "ten times their median residual of {residual:.2g} m"
+    "the positions spread over only {longer:.3g} by {shorter:.3g} m (standard deviations), and the shorter "
+    "must be ten times their median residual of {residual:.2g} m: photograph a larger area, or use "
+    "more accurate GPS"
 )
-
 ALTITUDE_STEPS = (
     "The altitudes in EXIF step by {steps}, as where a barometer starts anew: the steps were taken out, so "
     "heights in the model are those of the longest part between steps."

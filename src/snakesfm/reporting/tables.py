@@ -19,6 +19,14 @@ ROUND_HEADS = [
     "cost after",
     "mean error, detector px",
 ]
+PLACE_HEADS = [
+    "origin: latitude, longitude, altitude",
+    "images with position",
+    "inliers",
+    "median residual m",
+    "horizontal m",
+    "vertical m",
+]
 STATISTICS = ("median", "mean", "p90", "max")
 AREAS = re.compile(r"(?P<row>.*_auc)_(?P<column>[\d.]+)deg")
 ERRORS = re.compile(rf"(?P<row>.*)_(?P<column>{'|'.join(STATISTICS)})")
@@ -38,6 +46,23 @@ def bundle_rows(names: Array, counts: Array, costs: Array, errors_px: Array) -> 
     return [
         [str(names[k]), *counts[k].tolist(), *costs[k].tolist(), float(errors_px[k])]
         for k in range(len(names))
+    ]
+
+
+def place_rows(summary: Mapping[str, Any]) -> list[list[Any]]:
+    """Where the model was georeferenced, of what ``PLACE_HEADS`` names; no row where it was not."""
+    place = summary.get("georeference")
+    if place is None:
+        return []
+    latitude, longitude, altitude = place["origin_latitude_longitude_altitude"]
+    residuals = (f"median_{kind}residual_m" for kind in ("", "horizontal_", "vertical_"))
+    return [
+        [
+            f"{latitude:.6f}, {longitude:.6f}, {altitude:.2f} m",
+            place["images_with_position"],
+            place["inliers"],
+            *(place[name] for name in residuals),
+        ]
     ]
 
 

@@ -3,7 +3,6 @@
 import json
 import shutil
 import sys
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -16,20 +15,13 @@ from snakesfm.export.colmap import (
     registered_images,
     summarize,
 )
-from snakesfm.export.georeference import (
-    LEAST_IMAGES,
-    Georeference,
-    downward_axes,
-    georeference,
-    taking_order,
-)
 from snakesfm.export.image_folder import place_images
 from snakesfm.export.nerfstudio import camera_warnings, transforms
+from snakesfm.export.placement import Placement, find_placement
 from snakesfm.export.undistorted import undistorted_share, write_undistorted
 from snakesfm.geometry.camera import Camera, cameras_from_columns
-from snakesfm.geometry.earth import local_origin
 from snakesfm.geometry.lens_fit import MAX_MISFIT, fit_lenses
-from snakesfm.geometry.poses import center_of, to_camera, translation_of
+from snakesfm.geometry.poses import to_camera
 from snakesfm.ingest.masks import masks_as_large
 from snakesfm.stages.job import StageJob
 
@@ -88,22 +80,6 @@ LEAST_UNDISTORTED = 0.5
 # more of them add nothing about a lens
 OBSERVATIONS_OF_LENSES = 500_000
 
-NO_PLACE = (
-    "georeference is true, but fewer than four registered images have GPS in EXIF, or it does not agree "
-    "with the model: the model is not georeferenced."
-)
-
-NO_ALTITUDE = (
-    "georeference is true, but {count} registered images have GPS without altitude in EXIF, and fewer than "
-    "four with it: write GPSAltitude into EXIF."
-)
-
-UNTRUSTED_PLACE = (
-    "georeference is true, but the GPS positions in EXIF do not determine it reliably: {reason}."
-)
-
-UNUSED_PLACE = "The model is not georeferenced by the GPS positions in EXIF: {reason}."
-
 COPIES = "{count} images are exact copies of others and are left out; the originals are used."
 
 
@@ -111,11 +87,15 @@ def run(job: StageJob) -> None:
     """Write the files that ``job.outputs`` names, complete or not at all, summary.json last."""
     index = ImageIndex.read(job.path("index"))
     adjusted = Reconstruction.read(job.path("reconstruction"))
-    model, place = _placed(job, index, adjusted.select_model(0))
-    cameras = cameras_from_columns(model.camera_models, model.camera_sizes, model.camera_params)
     names = [str(name) for name in index.names]
+    placements = [
+        _placement(job, index, adjusted.select_model(number))
+        for number in range(max(1, adjusted.model_count))
+    ]
+    model = placements[0].move(adjusted.select_model(0))
+    cameras = cameras_from_columns(model.camera_models, model.camera_sizes, model.camera_params)
     registered = registered_images(model.rotations, model.translations)
-    warnings = _warnings(job, index, adjusted, model, place, cameras)
+    warnings = _warnings(job, index, adjusted, model, placements[0], cameras)
     given_masks = Path(job.settings["masks"]) if "masks" in job.settings else None
     of_image = {names[row]: cameras[index.camera_ids[row]] for row in registered}
     masks = _masks(given_masks, of_image, warnings)
@@ -123,18 +103,15 @@ def run(job: StageJob) -> None:
         sys.stderr.write(f"warning: {line}\n")
     folder = _export_folder(job)
     with temporary_folder(folder) as temporary:
-        for number in range(max(1, adjusted.model_count)):
-            selected = _placed(job, index, adjusted.select_model(number))[0] if number else model
+        for number, placement in enumerate(placements):
+            selected = placement.move(adjusted.select_model(number)) if number else model
             _write_colmap(temporary, number, _build(names, index, cameras, selected))
         content = transforms(
             names, index.camera_ids, cameras, model.rotations, model.translations, registered, masks
         )
         _write_json(temporary / "transforms.json", content)
         summary = summarize(job.scene, names, adjusted.models, model.offsets, model.errors_px, warnings)
-        told = (
-            place.summary(names) if place and (place.trusted or job.options.georeference is True) else None
-        )
-        _write_json(temporary / SUMMARY, {**summary, "georeference": told})
+        _write_json(temporary / SUMMARY, {**summary, **placements[0].summary(names)})
         _place_pictures(job, folder, names, index.orientations, masks)
         if job.options.undistort:
             write_undistorted(
@@ -152,7 +129,7 @@ def _warnings(
     index: ImageIndex,
     adjusted: Reconstruction,
     model: Reconstruction,
-    place: Georeference | None,
+    placement: Placement,
     cameras: list[Camera],
 ) -> list[str]:
     """What a user should know of the model, a sentence each."""
@@ -174,7 +151,7 @@ def _warnings(
         warnings.append(REFUSED.format(count=len(index.refused_names), first=index.refused_reasons[0]))
     warnings += [str(line) for line in index.warnings]
     warnings += [str(line) for line in CalibratedCameras.read(job.path("cameras")).warnings]
-    warnings += _place_warnings(place, names, job.options.georeference is True, index.gps[registered])
+    warnings += placement.warnings(names, job.options.georeference is True)
     copies = int(np.count_nonzero(index.duplicate_of >= 0))
     return warnings + ([COPIES.format(count=copies)] if copies else [])
 
@@ -220,24 +197,6 @@ def _cut_warnings(cameras: dict[int, Camera]) -> list[str]:
     ]
 
 
-def _place_warnings(
-    place: Georeference | None, names: list[str], is_wanted: bool, gps: np.ndarray
-) -> list[str]:
-    """Why there is no place though one is wanted, or none to rely on; ``gps`` is of registered images."""
-    if place is not None:
-        steps = place.step_warnings(names)
-        if place.trusted:
-            return steps
-        if is_wanted:
-            return [*steps, UNTRUSTED_PLACE.format(reason=place.refusal)]
-        return [UNUSED_PLACE.format(reason=place.refusal)]
-    if not is_wanted:
-        return []
-    known = np.isfinite(gps)
-    told, flat = int(known.all(axis=1).sum()), int(known[:, :2].all(axis=1).sum())
-    return [NO_ALTITUDE.format(count=flat - told) if told < min(LEAST_IMAGES, flat) else NO_PLACE]
-
-
 def _masks(folder: Path | None, cameras: dict[str, Camera], warnings: list[str]) -> dict[str, str]:
     """The masks of all images, given with their cameras; none and a warning where some are missing."""
     if folder is None:
@@ -251,28 +210,8 @@ def _masks(folder: Path | None, cameras: dict[str, Camera], warnings: list[str])
     return masks
 
 
-def _placed(
-    job: StageJob, index: ImageIndex, model: Reconstruction
-) -> tuple[Reconstruction, Georeference | None]:
-    """The model in metres east, north and up where EXIF tells where that is, and how well it does.
-
-    The model is as it was where the place that is found is not trusted.
-    """
-    wanted = job.options.georeference
-    origin = local_origin(index.gps) if wanted else None
-    if origin is None:
-        return model, None
-    centers = center_of(model.rotations, model.translations)
-    downward = downward_axes(model.rotations, index.orientations)
-    order = taking_order([str(name) for name in index.names])
-    place = georeference(centers, downward, index.gps, origin, order, job.seed_for("georeference"))
-    if place is None or not (place.trusted or wanted is True):
-        return model, place
-    move = place.local_from_model
-    rotations = move.transform_rotations(model.rotations)
-    translations = translation_of(rotations, move.transform_points(centers))
-    points = move.transform_points(model.points)
-    return replace(model, rotations=rotations, translations=translations, points=points), place
+def _placement(job: StageJob, index: ImageIndex, model: Reconstruction) -> Placement:
+    return find_placement(model, index, job.options.georeference, job.seed_for("georeference"))
 
 
 def _build(

@@ -2,6 +2,7 @@
 
 import csv
 import dataclasses
+import html
 import json
 import struct
 import sys
@@ -294,18 +295,91 @@ def test_the_world_stays_where_positions_contradict_it_or_are_not_wanted(tmp_pat
         folder = export(tmp_path / name, problem, gps=gps_of(problem, noise), **options)
         assert (folder / "sparse/0/images.bin").read_bytes() == without
         assert json.loads((folder / "summary.json").read_text())["georeference"] is None
-    asked = export(tmp_path / "asked", problem, georeference=True)
-    summary = json.loads((asked / "summary.json").read_text())
-    assert summary["georeference"] is None
-    assert any("GPS in EXIF" in line for line in summary["warnings"])
-    gps = gps_of(problem, 0.5)
+    for unused in (plain, folder):
+        summary = json.loads((unused / "summary.json").read_text())
+        assert summary["georeference_refused"] is None
+        assert not any("georeference" in line for line in summary["warnings"])
+
+
+def few_positions(gps: np.ndarray) -> None:
+    gps[3:] = np.nan
+
+
+def no_altitudes(gps: np.ndarray) -> None:
     gps[3:, 2] = np.nan
-    flat = export(tmp_path / "flat", problem, gps=gps, georeference=True)
-    summary = json.loads((flat / "summary.json").read_text())
+
+
+def of_the_lost_image(gps: np.ndarray) -> None:
+    gps[np.arange(COUNT) != LOST] = np.nan
+
+
+def in_another_order(gps: np.ndarray) -> None:
+    gps[:LOST] = gps[np.random.default_rng(0).permutation(LOST)]
+
+
+def within_a_metre(gps: np.ndarray) -> None:
+    gps[:] = pycolmap.GPSTransform().enu_to_ellipsoid(
+        0.02 * pycolmap.GPSTransform().ellipsoid_to_enu(gps, 47.0, 8.0, 500.0)
+        + np.random.default_rng(2).normal(size=gps.shape) * 0.9,
+        47.0,
+        8.0,
+        500.0,
+    )
+
+
+@pytest.mark.parametrize(
+    ("damage", "reason"),
+    [
+        (few_positions, "only 3 registered images have GPS in EXIF, and 4 are needed"),
+        # of nine images one is not registered
+        (
+            no_altitudes,
+            "5 registered images have GPS without altitude in EXIF, and fewer than four with it",
+        ),
+        (of_the_lost_image, "no registered image has GPS in EXIF"),
+        (in_another_order, "of 8 positions agree with the model"),
+        (within_a_metre, "the positions spread over only"),
+    ],
+)
+def test_why_positions_are_not_used_is_said_everywhere(tmp_path, problem, damage, reason) -> None:
+    gps = gps_of(problem, 0.1)
+    damage(gps)
+    folder = export(tmp_path, problem, gps=gps)
+    summary = json.loads((folder / "summary.json").read_text())
     assert summary["georeference"] is None
-    # of nine images one is not registered
+    assert reason in summary["georeference_refused"]
+    (line,) = (line for line in summary["warnings"] if "georeferenced" in line)
+    assert line == (
+        f"The model is not georeferenced by the GPS positions in EXIF: {summary['georeference_refused']}."
+    )
+    assert html.escape(reason) in report(tmp_path, problem, "", summary=summary)
+    wanted = export(tmp_path / "wanted", problem, gps=gps, georeference=True)
+    summary = json.loads((wanted / "summary.json").read_text())
     (line,) = (line for line in summary["warnings"] if "georeference is true" in line)
-    assert "but 5 registered images have GPS without altitude" in line and "GPSAltitude" in line
+    assert reason in line
+    used = damage in (in_another_order, within_a_metre)
+    assert (summary["georeference"] is not None) == used == (summary["georeference_refused"] is None)
+
+
+def test_where_no_image_has_gps_that_is_said_only_if_it_is_wanted(tmp_path, problem) -> None:
+    asked = export(tmp_path, problem, georeference=True)
+    summary = json.loads((asked / "summary.json").read_text())
+    assert summary["georeference_refused"] == "no registered image has GPS in EXIF"
+    assert any("georeference is true, but" in line for line in summary["warnings"])
+
+
+def test_the_report_says_where_the_model_is(tmp_path, problem) -> None:
+    folder = export(tmp_path, problem, gps=gps_of(problem, 0.5))
+    summary = json.loads((folder / "summary.json").read_text())
+    page = report(tmp_path, problem, "", summary=summary)
+    latitude, longitude, altitude = summary["georeference"]["origin_latitude_longitude_altitude"]
+    assert f"{latitude:.6f}, {longitude:.6f}, {altitude:.2f} m" in page
+    assert "<h2>Georeference</h2>" in page
+    for kind in ("", "horizontal_", "vertical_"):
+        residual = summary["georeference"][f"median_{kind}residual_m"]
+        assert 0.05 < residual < 2.0
+        assert f"{residual:.4g}" in page
+    assert "<h2>Georeference</h2>" not in report(tmp_path / "none", problem, "")
 
 
 def test_images_are_one_relative_link_and_a_second_run_gives_the_same_bytes(tmp_path, problem) -> None:
@@ -610,12 +684,13 @@ def report(
     problem: SyntheticProblem,
     reference: str,
     lost: Iterable[int] = (LOST,),
+    summary: dict[str, object] | None = None,
     **options: int,
 ) -> str:
     evaluate(tmp_path, problem, reference, lost)
     inputs = write_former_stages(tmp_path, problem)
     inputs["metrics"] = str(tmp_path / "evaluate_model" / "metrics.json")
-    write_json(tmp_path / "summary.json", {"warnings": ["camera 1: look <here>"]})
+    write_json(tmp_path / "summary.json", summary or {"warnings": ["camera 1: look <here>"]})
     inputs["summary"] = str(tmp_path / "summary.json")
     output = tmp_path / "render_report" / "index.html"
     render_report.run(

@@ -1,0 +1,114 @@
+"""The place of a model on the earth, and what a user should know of it."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import numpy as np
+
+from snakesfm.artifacts import ImageIndex, Reconstruction
+from snakesfm.export.colmap import registered_images
+from snakesfm.export.georeference import (
+    LEAST_IMAGES,
+    Georeference,
+    downward_axes,
+    georeference,
+    taking_order,
+)
+from snakesfm.geometry.earth import local_origin
+from snakesfm.geometry.poses import center_of, translation_of
+
+NO_GPS = "no registered image has GPS in EXIF"
+FEW_POSITIONS = f"only {{count}} registered images have GPS in EXIF, and {LEAST_IMAGES} are needed"
+NO_ALTITUDE = (
+    "{count} registered images have GPS without altitude in EXIF, and fewer than four with it: write "
+    "GPSAltitude into EXIF"
+)
+NO_SIMILARITY = "no four of the positions agree with the model"
+
+UNPLACED = "The model is not georeferenced by the GPS positions in EXIF: {reason}."
+WANTED = "georeference is true, but the model is not georeferenced: {reason}."
+UNTRUSTED = "georeference is true, but the GPS positions in EXIF do not determine it reliably: {reason}."
+
+
+@dataclass(frozen=True)
+class Placement:
+    """Where a model is.
+
+    Parameters
+    ----------
+    place : by which the model is moved, None where it stays in the coordinate frame of the adjustment.
+    doubt : why there is no place, or why it is not to be relied on, a clause; empty where all is well and
+        where none is wanted or no image has GPS.
+    """
+
+    place: Georeference | None
+    doubt: str
+
+    def move(self, model: Reconstruction) -> Reconstruction:
+        """The model in metres east, north and up; itself where it has no place."""
+        if self.place is None:
+            return model
+        to_local = self.place.local_from_model
+        rotations = to_local.transform_rotations(model.rotations)
+        centers = to_local.transform_points(center_of(model.rotations, model.translations))
+        return replace(
+            model,
+            rotations=rotations,
+            translations=translation_of(rotations, centers),
+            points=to_local.transform_points(model.points),
+        )
+
+    def summary(self, names: Sequence[str]) -> dict[str, Any]:
+        """What summary.json says, with the names of all images."""
+        return {
+            "georeference": self.place and self.place.summary(names),
+            "georeference_refused": None if self.place else self.doubt or None,
+        }
+
+    def warnings(self, names: Sequence[str], is_wanted: bool) -> list[str]:
+        """Why there is no place, or none to rely on, and how it was found, with the names of all images."""
+        if self.place is None:
+            return [(WANTED if is_wanted else UNPLACED).format(reason=self.doubt)] if self.doubt else []
+        doubts = [UNTRUSTED.format(reason=self.doubt)] if self.doubt else []
+        return self.place.step_warnings(names) + doubts
+
+
+def find_placement(
+    model: Reconstruction, index: ImageIndex, wanted: Literal["auto"] | bool, seed: int
+) -> Placement:
+    """Where EXIF says that the model is.
+
+    Parameters
+    ----------
+    wanted : False to leave the model where it is, True to move it even if positions are not to be trusted.
+    seed : of the random draws.
+    """
+    if wanted is False:
+        return Placement(None, "")
+    gps = index.gps[registered_images(model.rotations, model.translations)]
+    on_map = np.isfinite(gps[:, :2]).all(axis=1)
+    in_space = int(np.isfinite(gps[on_map]).all(axis=1).sum())
+    count = int(on_map.sum())
+    if not count:
+        some = np.isfinite(index.gps[:, :2]).all(axis=1).any()
+        return Placement(None, NO_GPS if some or wanted is True else "")
+    if in_space < LEAST_IMAGES:
+        few = count < LEAST_IMAGES or count == in_space
+        return Placement(
+            None, FEW_POSITIONS.format(count=count) if few else NO_ALTITUDE.format(count=count - in_space)
+        )
+    # of all images, so that all models share it
+    origin = local_origin(index.gps)
+    assert origin is not None
+    place = georeference(
+        center_of(model.rotations, model.translations),
+        downward_axes(model.rotations, index.orientations),
+        index.gps,
+        origin,
+        taking_order([str(name) for name in index.names]),
+        seed,
+    )
+    if place is None:
+        return Placement(None, NO_SIMILARITY)
+    return Placement(place if place.trusted or wanted is True else None, place.refusal)
