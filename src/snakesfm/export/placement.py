@@ -18,17 +18,28 @@ from snakesfm.export.georeference import (
 from snakesfm.geometry.earth import local_origin
 from snakesfm.geometry.poses import center_of, translation_of
 
-NO_GPS = "no registered image has GPS in EXIF"
-FEW_POSITIONS = f"only {{count}} registered images have GPS in EXIF, and {LEAST_IMAGES} are needed"
+NO_GPS = "no image of the model has GPS in EXIF"
+FEW_POSITIONS = f"only {{count}} images of the model have GPS in EXIF, and {LEAST_IMAGES} are needed"
 NO_ALTITUDE = (
-    "{count} registered images have GPS without altitude in EXIF, and fewer than four with it: write "
+    "{count} images of the model have GPS without altitude in EXIF, and fewer than four with it: write "
     "GPSAltitude into EXIF"
 )
 NO_SIMILARITY = "no four of the positions agree with the model"
 
 UNPLACED = "The model is not georeferenced by the GPS positions in EXIF: {reason}."
 WANTED = "georeference is true, but the model is not georeferenced: {reason}."
-UNTRUSTED = "georeference is true, but the GPS positions in EXIF do not determine it reliably: {reason}."
+UNTRUSTED = (
+    "georeference is true, but the GPS positions in EXIF do not determine {model} reliably: {reason}."
+)
+
+OWN_FRAMES = ", each in its own coordinate frame"
+ONE_FRAME = ", all in metres east, north and up from the origin in summary.json"
+SOME_PLACED = (
+    ", each model in its own coordinate frame but for those in metres east, north and up from the origin "
+    "in summary.json (georeference_of_models): {folders}"
+)
+# more would make a sentence long
+MOST_FOLDERS = 5
 
 
 @dataclass(frozen=True)
@@ -59,19 +70,40 @@ class Placement:
             points=to_local.transform_points(model.points),
         )
 
-    def summary(self, names: Sequence[str]) -> dict[str, Any]:
-        """What summary.json says, with the names of all images."""
-        return {
-            "georeference": self.place and self.place.summary(names),
-            "georeference_refused": None if self.place else self.doubt or None,
-        }
 
-    def warnings(self, names: Sequence[str], is_wanted: bool) -> list[str]:
-        """Why there is no place, or none to rely on, and how it was found, with the names of all images."""
-        if self.place is None:
-            return [(WANTED if is_wanted else UNPLACED).format(reason=self.doubt)] if self.doubt else []
-        doubts = [UNTRUSTED.format(reason=self.doubt)] if self.doubt else []
-        return self.place.step_warnings(names) + doubts
+def placement_summary(placements: Sequence[Placement], names: Sequence[str]) -> dict[str, Any]:
+    """What summary.json says of the places of all models, with the names of all images."""
+    places = [placement.place and placement.place.summary(names) for placement in placements]
+    return {
+        "georeference": places[0],
+        "georeference_refused": None if places[0] else placements[0].doubt or None,
+        "georeference_of_models": places,
+    }
+
+
+def placement_warnings(placements: Sequence[Placement], names: Sequence[str], is_wanted: bool) -> list[str]:
+    """Why the first model has no place, why places are not to be relied on, and steps of altitude."""
+    warnings = []
+    for number, (place, doubt) in enumerate((each.place, each.doubt) for each in placements):
+        model = f"sparse/{number}" if number else "the model"
+        if place is not None:
+            warnings += place.step_warnings(names)
+        if doubt and place is not None:
+            warnings.append(UNTRUSTED.format(model=model, reason=doubt))
+        elif doubt and number == 0:
+            warnings.append((WANTED if is_wanted else UNPLACED).format(reason=doubt))
+    return warnings
+
+
+def describe_frames(placements: Sequence[Placement]) -> str:
+    """The end of a sentence about separate models: which share a coordinate frame."""
+    placed = [f"sparse/{number}" for number, each in enumerate(placements) if each.place is not None]
+    if not placed:
+        return OWN_FRAMES
+    if len(placed) == len(placements):
+        return ONE_FRAME
+    more = ["others"] if len(placed) > MOST_FOLDERS else []
+    return SOME_PLACED.format(folders=", ".join(placed[:MOST_FOLDERS] + more))
 
 
 def find_placement(

@@ -20,6 +20,7 @@ ROUND_HEADS = [
     "mean error, detector px",
 ]
 PLACE_HEADS = [
+    "model",
     "origin: latitude, longitude, altitude",
     "images with position",
     "inliers",
@@ -50,19 +51,18 @@ def bundle_rows(names: Array, counts: Array, costs: Array, errors_px: Array) -> 
 
 
 def place_rows(summary: Mapping[str, Any]) -> list[list[Any]]:
-    """Where the model was georeferenced, of what ``PLACE_HEADS`` names; no row where it was not."""
-    place = summary.get("georeference")
-    if place is None:
-        return []
-    latitude, longitude, altitude = place["origin_latitude_longitude_altitude"]
-    residuals = (f"median_{kind}residual_m" for kind in ("", "horizontal_", "vertical_"))
+    """Where models were georeferenced, of what ``PLACE_HEADS`` names; no rows where none was."""
+    residuals = [f"median_{kind}residual_m" for kind in ("", "horizontal_", "vertical_")]
     return [
         [
-            f"{latitude:.6f}, {longitude:.6f}, {altitude:.2f} m",
+            f"sparse/{number}",
+            "{:.6f}, {:.6f}, {:.2f} m".format(*place["origin_latitude_longitude_altitude"]),
             place["images_with_position"],
             place["inliers"],
             *(place[name] for name in residuals),
         ]
+        for number, place in enumerate(summary.get("georeference_of_models", []))
+        if place is not None
     ]
 
 

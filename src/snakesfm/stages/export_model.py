@@ -17,7 +17,13 @@ from snakesfm.export.colmap import (
 )
 from snakesfm.export.image_folder import place_images
 from snakesfm.export.nerfstudio import camera_warnings, transforms
-from snakesfm.export.placement import Placement, find_placement
+from snakesfm.export.placement import (
+    Placement,
+    describe_frames,
+    find_placement,
+    placement_summary,
+    placement_warnings,
+)
 from snakesfm.export.undistorted import undistorted_share, write_undistorted
 from snakesfm.geometry.camera import Camera, cameras_from_columns
 from snakesfm.geometry.lens_fit import MAX_MISFIT, fit_lenses
@@ -37,8 +43,8 @@ SPACES = (
 )
 
 OTHER_MODELS = (
-    "{images} images could not be connected to the largest model: they form {count} separate models, each "
-    "in its own coordinate frame, in folders next to sparse/0."
+    "{images} images could not be connected to the largest model: they form {count} separate models in "
+    "folders next to sparse/0{frames}."
 )
 
 MISSING_MASKS = (
@@ -95,7 +101,7 @@ def run(job: StageJob) -> None:
     model = placements[0].move(adjusted.select_model(0))
     cameras = cameras_from_columns(model.camera_models, model.camera_sizes, model.camera_params)
     registered = registered_images(model.rotations, model.translations)
-    warnings = _warnings(job, index, adjusted, model, placements[0], cameras)
+    warnings = _warnings(job, index, adjusted, model, placements, cameras)
     given_masks = Path(job.settings["masks"]) if "masks" in job.settings else None
     of_image = {names[row]: cameras[index.camera_ids[row]] for row in registered}
     masks = _masks(given_masks, of_image, warnings)
@@ -111,7 +117,7 @@ def run(job: StageJob) -> None:
         )
         _write_json(temporary / "transforms.json", content)
         summary = summarize(job.scene, names, adjusted.models, model.offsets, model.errors_px, warnings)
-        _write_json(temporary / SUMMARY, {**summary, **placements[0].summary(names)})
+        _write_json(temporary / SUMMARY, {**summary, **placement_summary(placements, names)})
         _place_pictures(job, folder, names, index.orientations, masks)
         if job.options.undistort:
             write_undistorted(
@@ -129,7 +135,7 @@ def _warnings(
     index: ImageIndex,
     adjusted: Reconstruction,
     model: Reconstruction,
-    placement: Placement,
+    placements: list[Placement],
     cameras: list[Camera],
 ) -> list[str]:
     """What a user should know of the model, a sentence each."""
@@ -146,12 +152,14 @@ def _warnings(
         warnings.append(SPACES)
     others = other_model_sizes(adjusted.models)
     if others:
-        warnings.append(OTHER_MODELS.format(images=sum(others), count=len(others)))
+        warnings.append(
+            OTHER_MODELS.format(images=sum(others), count=len(others), frames=describe_frames(placements))
+        )
     if len(index.refused_names):
         warnings.append(REFUSED.format(count=len(index.refused_names), first=index.refused_reasons[0]))
     warnings += [str(line) for line in index.warnings]
     warnings += [str(line) for line in CalibratedCameras.read(job.path("cameras")).warnings]
-    warnings += placement.warnings(names, job.options.georeference is True)
+    warnings += placement_warnings(placements, names, job.options.georeference is True)
     copies = int(np.count_nonzero(index.duplicate_of >= 0))
     return warnings + ([COPIES.format(count=copies)] if copies else [])
 

@@ -33,6 +33,7 @@ from snakesfm.config.render_report import RenderReportOptions
 from snakesfm.evaluation.colmap_model import read_model
 from snakesfm.export.undistorted import write_undistorted
 from snakesfm.geometry.camera import Camera, cameras_to_columns
+from snakesfm.geometry.earth import local_metres, local_origin
 from snakesfm.job_logs import describe_cost
 from snakesfm.stages import evaluate_model, export_model, render_report
 from snakesfm.stages.job import StageJob
@@ -105,11 +106,20 @@ def write_reconstruction(
     lost: Iterable[int] = (LOST,),
     reset: str = "",
     offset: float = np.nan,
+    second: Iterable[int] = (),
 ) -> Path:
-    """The truth as a finished model, ``lost`` images not registered; what is wrong with the second camera."""
+    """The truth as a finished model, ``lost`` images not registered, those of a ``second`` model apart.
+
+    Also what is wrong with the second camera.
+    """
     rotations, translations = problem.rotations.copy(), problem.translations.copy()
     rotations[list(lost)], translations[list(lost)] = np.nan, np.nan
     keep = ~np.isin(problem.track_image_ids, list(lost))
+    model_of = np.isin(np.arange(COUNT), list(second)).astype(np.int32)
+    if model_of.any():
+        # every other point is of the second model
+        point_of = np.repeat(np.arange(len(problem.points)), np.diff(problem.track_offsets))
+        keep &= model_of[problem.track_image_ids] == point_of % 2
     lengths = np.add.reduceat(keep.astype(int), problem.track_offsets[:-1])
     seen = lengths > 0
     models, sizes, params, _ = cameras_to_columns([CAMERA, CAMERA])
@@ -122,7 +132,7 @@ def write_reconstruction(
         camera_offsets=np.array([np.nan, offset]),
         rotations=rotations,
         translations=translations,
-        models=np.where(np.isin(np.arange(COUNT), list(lost)), -1, 0),
+        models=np.where(np.isin(np.arange(COUNT), list(lost)), -1, model_of),
         points=problem.points[seen],
         colors=np.arange(count * 3).reshape(-1, 3).astype(np.uint8),
         errors_px=np.linspace(0.1, 0.5, count),
@@ -154,12 +164,13 @@ def export(
     masks: Path | None = None,
     reset: str = "",
     offset: float = np.nan,
+    second: Iterable[int] = (),
     **options: bool,
 ) -> Path:
     inputs = {
         "index": str(write_index(tmp_path, orientations, gps)),
         "cameras": str(write_cameras(tmp_path)),
-        "reconstruction": str(write_reconstruction(tmp_path, problem, lost, reset, offset)),
+        "reconstruction": str(write_reconstruction(tmp_path, problem, lost, reset, offset, second)),
     }
     folder = tmp_path / "out" / "scene" / "export_model"
     images = tmp_path / "photos"
@@ -330,13 +341,13 @@ def within_a_metre(gps: np.ndarray) -> None:
 @pytest.mark.parametrize(
     ("damage", "reason"),
     [
-        (few_positions, "only 3 registered images have GPS in EXIF, and 4 are needed"),
+        (few_positions, "only 3 images of the model have GPS in EXIF, and 4 are needed"),
         # of nine images one is not registered
         (
             no_altitudes,
-            "5 registered images have GPS without altitude in EXIF, and fewer than four with it",
+            "5 images of the model have GPS without altitude in EXIF, and fewer than four with it",
         ),
-        (of_the_lost_image, "no registered image has GPS in EXIF"),
+        (of_the_lost_image, "no image of the model has GPS in EXIF"),
         (in_another_order, "of 8 positions agree with the model"),
         (within_a_metre, "the positions spread over only"),
     ],
@@ -361,10 +372,49 @@ def test_why_positions_are_not_used_is_said_everywhere(tmp_path, problem, damage
     assert (summary["georeference"] is not None) == used == (summary["georeference_refused"] is None)
 
 
+@pytest.mark.parametrize(
+    ("without", "sentence"),
+    [
+        (
+            (),
+            "in folders next to sparse/0, all in metres east, north and up from the origin in summary.json.",
+        ),
+        ((0, 1, 2, 3), "summary.json (georeference_of_models): sparse/1."),
+        ((4, 5, 6, 7), "summary.json (georeference_of_models): sparse/0."),
+        (range(8), "in folders next to sparse/0, each in its own coordinate frame."),
+    ],
+)
+def test_it_is_told_which_of_separate_models_are_georeferenced(
+    tmp_path, problem, without, sentence
+) -> None:
+    gps = gps_of(problem, 0.05)
+    gps[list(without)] = np.nan
+    folder = export(tmp_path, problem, gps=gps, second=(4, 5, 6, 7))
+    summary = json.loads((folder / "summary.json").read_text())
+    first, second = summary["georeference_of_models"]
+    assert summary["georeference"] == first
+    assert (first is None) == (0 in without)
+    assert (second is None) == (4 in without)
+    (line,) = (line for line in summary["warnings"] if "could not be connected" in line)
+    assert line.startswith("4 images could not be connected") and line.endswith(sentence)
+    origin = local_origin(gps)
+    page = report(tmp_path, problem, "", summary=summary)
+    for number, place in enumerate((first, second)):
+        assert (f"<td>sparse/{number}</td>" in page) == (place is not None)
+        if place is None:
+            continue
+        assert place["origin_latitude_longitude_altitude"] == list(origin)
+        assert (place["images_with_position"], place["inliers"]) == (4, 4)
+        model = read_model(folder / "sparse" / str(number))
+        places = local_metres(gps, origin)
+        for image in model.images.values():
+            assert np.linalg.norm(image.projection_center() - places[image.image_id - 1]) < 1.0
+
+
 def test_where_no_image_has_gps_that_is_said_only_if_it_is_wanted(tmp_path, problem) -> None:
     asked = export(tmp_path, problem, georeference=True)
     summary = json.loads((asked / "summary.json").read_text())
-    assert summary["georeference_refused"] == "no registered image has GPS in EXIF"
+    assert summary["georeference_refused"] == "no image of the model has GPS in EXIF"
     assert any("georeference is true, but" in line for line in summary["warnings"])
 
 
