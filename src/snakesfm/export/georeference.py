@@ -8,7 +8,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from snakesfm.arrays import Array
-from snakesfm.export.altitude_steps import altitude_steps
 from snakesfm.geometry.colmap_binding import pycolmap
 from snakesfm.geometry.earth import Origin, local_metres
 from snakesfm.geometry.poses import Similarity
@@ -221,6 +220,9 @@ def _without_steps(
     fit: _Fit, sources: Array, places: Array, seed: int
 ) -> tuple[_Fit, list[tuple[int, float]]]:
     """The fit to positions without steps of altitude, and the steps; the same fit where there are none."""
+    # loaded here, as models without GPS do without scipy
+    from snakesfm.export.altitude_steps import altitude_steps
+
     steps: list[tuple[int, float]] = []
     for _ in range(STEP_ROUNDS):
         centers = fit.similarity.transform_points(sources)
