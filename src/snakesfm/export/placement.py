@@ -1,12 +1,12 @@
 """The place of a model on the earth, and what a user should know of it."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
 
-from snakesfm.artifacts import ImageIndex, Reconstruction
+from snakesfm.arrays import Array
 from snakesfm.export.colmap import registered_images
 from snakesfm.export.georeference import (
     LEAST_IMAGES,
@@ -56,19 +56,20 @@ class Placement:
     place: Georeference | None
     doubt: str
 
-    def move(self, model: Reconstruction) -> Reconstruction:
-        """The model in metres east, north and up; itself where it has no place."""
+    def move(self, rotations: Array, translations: Array, points: Array) -> tuple[Array, Array, Array]:
+        """Poses and points in metres east, north and up; as they are where there is no place.
+
+        Parameters
+        ----------
+        rotations, translations : (N,3,3) and (N,3) cam_from_world.
+        points : (T,3).
+        """
         if self.place is None:
-            return model
+            return rotations, translations, points
         to_local = self.place.local_from_model
-        rotations = to_local.transform_rotations(model.rotations)
-        centers = to_local.transform_points(center_of(model.rotations, model.translations))
-        return replace(
-            model,
-            rotations=rotations,
-            translations=translation_of(rotations, centers),
-            points=to_local.transform_points(model.points),
-        )
+        centers = to_local.transform_points(center_of(rotations, translations))
+        turned = to_local.transform_rotations(rotations)
+        return turned, translation_of(turned, centers), to_local.transform_points(points)
 
 
 def placement_summary(placements: Sequence[Placement], names: Sequence[str]) -> dict[str, Any]:
@@ -107,23 +108,32 @@ def describe_frames(placements: Sequence[Placement]) -> str:
 
 
 def find_placement(
-    model: Reconstruction, index: ImageIndex, wanted: Literal["auto"] | bool, seed: int
+    rotations: Array,
+    translations: Array,
+    orientations: Array,
+    gps: Array,
+    names: Sequence[str],
+    wanted: Literal["auto"] | bool,
+    seed: int,
 ) -> Placement:
     """Where EXIF says that the model is.
 
     Parameters
     ----------
+    rotations, translations : (N,3,3) and (N,3) cam_from_world, NaN where not registered in the model.
+    orientations, gps, names : EXIF and name of each image, as :func:`downward_axes`,
+        :func:`georeference` and :func:`taking_order` want them.
     wanted : False to leave the model where it is, True to move it even if positions are not to be trusted.
     seed : of the random draws.
     """
     if wanted is False:
         return Placement(None, "")
-    gps = index.gps[registered_images(model.rotations, model.translations)]
-    on_map = np.isfinite(gps[:, :2]).all(axis=1)
-    in_space = int(np.isfinite(gps[on_map]).all(axis=1).sum())
+    mine = gps[registered_images(rotations, translations)]
+    on_map = np.isfinite(mine[:, :2]).all(axis=1)
+    in_space = int(np.isfinite(mine[on_map]).all(axis=1).sum())
     count = int(on_map.sum())
     if not count:
-        some = np.isfinite(index.gps[:, :2]).all(axis=1).any()
+        some = np.isfinite(gps[:, :2]).all(axis=1).any()
         return Placement(None, NO_GPS if some or wanted is True else "")
     if in_space < LEAST_IMAGES:
         few = count < LEAST_IMAGES or count == in_space
@@ -131,14 +141,14 @@ def find_placement(
             None, FEW_POSITIONS.format(count=count) if few else NO_ALTITUDE.format(count=count - in_space)
         )
     # of all images, so that all models share it
-    origin = local_origin(index.gps)
+    origin = local_origin(gps)
     assert origin is not None
     place = georeference(
-        center_of(model.rotations, model.translations),
-        downward_axes(model.rotations, index.orientations),
-        index.gps,
+        center_of(rotations, translations),
+        downward_axes(rotations, orientations),
+        gps,
         origin,
-        taking_order([str(name) for name in index.names]),
+        taking_order(names),
         seed,
     )
     if place is None:

@@ -3,6 +3,7 @@
 import json
 import shutil
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -98,7 +99,7 @@ def run(job: StageJob) -> None:
         _placement(job, index, adjusted.select_model(number))
         for number in range(max(1, adjusted.model_count))
     ]
-    model = placements[0].move(adjusted.select_model(0))
+    model = _moved(adjusted.select_model(0), placements[0])
     cameras = cameras_from_columns(model.camera_models, model.camera_sizes, model.camera_params)
     registered = registered_images(model.rotations, model.translations)
     warnings = _warnings(job, index, adjusted, model, placements, cameras)
@@ -110,7 +111,7 @@ def run(job: StageJob) -> None:
     folder = _export_folder(job)
     with temporary_folder(folder) as temporary:
         for number, placement in enumerate(placements):
-            selected = placement.move(adjusted.select_model(number)) if number else model
+            selected = _moved(adjusted.select_model(number), placement) if number else model
             _write_colmap(temporary, number, _build(names, index, cameras, selected))
         content = transforms(
             names, index.camera_ids, cameras, model.rotations, model.translations, registered, masks
@@ -219,7 +220,20 @@ def _masks(folder: Path | None, cameras: dict[str, Camera], warnings: list[str])
 
 
 def _placement(job: StageJob, index: ImageIndex, model: Reconstruction) -> Placement:
-    return find_placement(model, index, job.options.georeference, job.seed_for("georeference"))
+    return find_placement(
+        model.rotations,
+        model.translations,
+        index.orientations,
+        index.gps,
+        [str(name) for name in index.names],
+        job.options.georeference,
+        job.seed_for("georeference"),
+    )
+
+
+def _moved(model: Reconstruction, placement: Placement) -> Reconstruction:
+    rotations, translations, points = placement.move(model.rotations, model.translations, model.points)
+    return replace(model, rotations=rotations, translations=translations, points=points)
 
 
 def _build(
