@@ -179,4 +179,5 @@ def _degrees(value: Any, reference: Any, negative: str) -> float:
     if len(parts) != 3:
         return math.nan
     degrees = parts[0] + parts[1] / 60 + parts[2] / 3600
-    return -degrees if _text(reference).upper() == negative else degrees
+    # some programs write the word
+    return -degrees if _text(reference)[:1].upper() == negative else degrees

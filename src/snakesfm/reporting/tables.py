@@ -19,6 +19,15 @@ ROUND_HEADS = [
     "cost after",
     "mean error, detector px",
 ]
+PLACE_HEADS = [
+    "model",
+    "origin: latitude, longitude, altitude",
+    "images with position",
+    "inliers",
+    "median residual m",
+    "horizontal m",
+    "vertical m",
+]
 STATISTICS = ("median", "mean", "p90", "max")
 AREAS = re.compile(r"(?P<row>.*_auc)_(?P<column>[\d.]+)deg")
 ERRORS = re.compile(rf"(?P<row>.*)_(?P<column>{'|'.join(STATISTICS)})")
@@ -38,6 +47,22 @@ def bundle_rows(names: Array, counts: Array, costs: Array, errors_px: Array) -> 
     return [
         [str(names[k]), *counts[k].tolist(), *costs[k].tolist(), float(errors_px[k])]
         for k in range(len(names))
+    ]
+
+
+def place_rows(summary: Mapping[str, Any]) -> list[list[Any]]:
+    """Where models were georeferenced, of what ``PLACE_HEADS`` names; no rows where none was."""
+    residuals = [f"median_{kind}residual_m" for kind in ("", "horizontal_", "vertical_")]
+    return [
+        [
+            f"sparse/{number}",
+            "{:.6f}, {:.6f}, {:.2f} m".format(*place["origin_latitude_longitude_altitude"]),
+            place["images_with_position"],
+            place["inliers"],
+            *(place[name] for name in residuals),
+        ]
+        for number, place in enumerate(summary.get("georeference_of_models", []))
+        if place is not None
     ]
 
 

@@ -12,14 +12,19 @@ import numpy as np
 from snakesfm.artifacts import CalibratedCameras, ImageIndex, Reconstruction, temporary_folder
 from snakesfm.artifacts.gather import gather_image_columns
 from snakesfm.export.colmap import build_reconstruction, other_model_sizes, summarize
-from snakesfm.export.georeference import LEAST_IMAGES, Georeference, georeference
 from snakesfm.export.image_folder import place_images
 from snakesfm.export.nerfstudio import camera_warnings, transforms
+from snakesfm.export.placement import (
+    Placement,
+    describe_frames,
+    find_placement,
+    placement_summary,
+    placement_warnings,
+)
 from snakesfm.export.undistorted import undistorted_share, write_undistorted
 from snakesfm.geometry.camera import Camera, cameras_from_columns
-from snakesfm.geometry.earth import local_origin
 from snakesfm.geometry.lens_fit import MAX_MISFIT, fit_lenses
-from snakesfm.geometry.poses import center_of, has_pose, to_camera, translation_of
+from snakesfm.geometry.poses import has_pose, to_camera
 from snakesfm.ingest.masks import masks_as_large
 from snakesfm.stages.job import StageJob
 
@@ -35,8 +40,8 @@ SPACES = (
 )
 
 OTHER_MODELS = (
-    "{images} images could not be connected to the largest model: they form {count} separate models, each "
-    "in its own coordinate frame, in folders next to sparse/0."
+    "{images} images could not be connected to the largest model: they form {count} separate models in "
+    "folders next to sparse/0{frames}."
 )
 
 MISSING_MASKS = (
@@ -78,21 +83,6 @@ LEAST_UNDISTORTED = 0.5
 # more of them add nothing about a lens
 OBSERVATIONS_OF_LENSES = 500_000
 
-NO_PLACE = (
-    "georeference is true, but fewer than four registered images have GPS in EXIF, or it does not agree "
-    "with the model: the model is not georeferenced."
-)
-
-NO_ALTITUDE = (
-    "georeference is true, but {count} registered images have GPS without altitude in EXIF, and fewer than "
-    "four with it: write GPSAltitude into EXIF."
-)
-
-UNTRUSTED_PLACE = (
-    "georeference is true, but the GPS positions in EXIF do not determine it reliably: only {inliers} of "
-    "{images} agree with the model, or they lie on one line."
-)
-
 COPIES = "{count} images are exact copies of others and are left out; the originals are used."
 
 
@@ -100,11 +90,15 @@ def run(job: StageJob) -> None:
     """Write the files that ``job.outputs`` names, complete or not at all, summary.json last."""
     index = ImageIndex.read(job.path("index"))
     adjusted = Reconstruction.read(job.path("reconstruction"))
-    model, place = _placed(job, index, adjusted.select_model(0))
-    cameras = cameras_from_columns(model.camera_models, model.camera_sizes, model.camera_params)
     names = [str(name) for name in index.names]
+    placements = [
+        _placement(job, index, adjusted.select_model(number))
+        for number in range(max(1, adjusted.model_count))
+    ]
+    model = _moved(adjusted.select_model(0), placements[0])
+    cameras = cameras_from_columns(model.camera_models, model.camera_sizes, model.camera_params)
     registered = np.flatnonzero(has_pose(model.rotations, model.translations))
-    warnings = _warnings(job, index, adjusted, model, place, cameras)
+    warnings = _warnings(job, index, adjusted, model, placements, cameras)
     given_masks = Path(job.settings["masks"]) if "masks" in job.settings else None
     of_image = {names[row]: cameras[index.camera_ids[row]] for row in registered}
     masks = _masks(given_masks, of_image, warnings)
@@ -113,15 +107,15 @@ def run(job: StageJob) -> None:
     folder = _export_folder(job)
     keypoints = _all_keypoints(job, index)
     with temporary_folder(folder) as temporary:
-        for number in range(max(1, adjusted.model_count)):
-            selected = _placed(job, index, adjusted.select_model(number))[0] if number else model
+        for number, placement in enumerate(placements):
+            selected = _moved(adjusted.select_model(number), placement) if number else model
             _write_colmap(temporary, number, _build(names, index, cameras, selected, keypoints))
         content = transforms(
             names, index.camera_ids, cameras, model.rotations, model.translations, registered, masks
         )
         _write_json(temporary / "transforms.json", content)
         summary = summarize(job.scene, names, adjusted.models, model.offsets, model.errors_px, warnings)
-        _write_json(temporary / SUMMARY, {**summary, "georeference": place and place.summary()})
+        _write_json(temporary / SUMMARY, {**summary, **placement_summary(placements, names)})
         _place_pictures(job, folder, names, index.orientations, masks)
         if job.options.undistort:
             write_undistorted(
@@ -139,10 +133,11 @@ def _warnings(
     index: ImageIndex,
     adjusted: Reconstruction,
     model: Reconstruction,
-    place: Georeference | None,
+    placements: list[Placement],
     cameras: list[Camera],
 ) -> list[str]:
     """What a user should know of the model, a sentence each."""
+    names = [str(name) for name in index.names]
     registered = np.flatnonzero(has_pose(model.rotations, model.translations))
     used = {row: cameras[row] for row in sorted({int(index.camera_ids[row]) for row in registered})}
     warnings = _camera_warnings(adjusted, used)
@@ -151,16 +146,18 @@ def _warnings(
         warnings += _cut_warnings(used)
     if len({camera.is_fisheye for camera in used.values()}) > 1:
         warnings.append(MIXED_LENSES)
-    if any(" " in str(index.names[row]) for row in registered):
+    if any(" " in names[row] for row in registered):
         warnings.append(SPACES)
     others = other_model_sizes(adjusted.models)
     if others:
-        warnings.append(OTHER_MODELS.format(images=sum(others), count=len(others)))
+        warnings.append(
+            OTHER_MODELS.format(images=sum(others), count=len(others), frames=describe_frames(placements))
+        )
     if len(index.refused_names):
         warnings.append(REFUSED.format(count=len(index.refused_names), first=index.refused_reasons[0]))
     warnings += [str(line) for line in index.warnings]
     warnings += [str(line) for line in CalibratedCameras.read(job.path("cameras")).warnings]
-    warnings += _place_warnings(place, job.options.georeference is True, index.gps[registered])
+    warnings += placement_warnings(placements, names, job.options.georeference is True)
     copies = int(np.count_nonzero(index.duplicate_of >= 0))
     return warnings + ([COPIES.format(count=copies)] if copies else [])
 
@@ -206,17 +203,6 @@ def _cut_warnings(cameras: dict[int, Camera]) -> list[str]:
     ]
 
 
-def _place_warnings(place: Georeference | None, is_wanted: bool, gps: np.ndarray) -> list[str]:
-    """Why there is no place though one is wanted, or none to rely on; ``gps`` is of registered images."""
-    if place is not None:
-        return [] if place.trusted else [UNTRUSTED_PLACE.format(inliers=place.inliers, images=place.images)]
-    if not is_wanted:
-        return []
-    known = np.isfinite(gps)
-    told, flat = int(known.all(axis=1).sum()), int(known[:, :2].all(axis=1).sum())
-    return [NO_ALTITUDE.format(count=flat - told) if told < min(LEAST_IMAGES, flat) else NO_PLACE]
-
-
 def _masks(folder: Path | None, cameras: dict[str, Camera], warnings: list[str]) -> dict[str, str]:
     """The masks of all images, given with their cameras; none and a warning where some are missing."""
     if folder is None:
@@ -230,23 +216,21 @@ def _masks(folder: Path | None, cameras: dict[str, Camera], warnings: list[str])
     return masks
 
 
-def _placed(
-    job: StageJob, index: ImageIndex, model: Reconstruction
-) -> tuple[Reconstruction, Georeference | None]:
-    """The model in metres east, north and up where EXIF tells where that is, and how well it does."""
-    wanted = job.options.georeference
-    origin = local_origin(index.gps) if wanted else None
-    if origin is None:
-        return model, None
-    centers = center_of(model.rotations, model.translations)
-    place = georeference(centers, index.gps, origin, job.seed_for("georeference"))
-    if place is None or not (place.trusted or wanted is True):
-        return model, None
-    move = place.local_from_model
-    rotations = move.transform_rotations(model.rotations)
-    translations = translation_of(rotations, move.transform_points(centers))
-    points = move.transform_points(model.points)
-    return replace(model, rotations=rotations, translations=translations, points=points), place
+def _placement(job: StageJob, index: ImageIndex, model: Reconstruction) -> Placement:
+    return find_placement(
+        model.rotations,
+        model.translations,
+        index.orientations,
+        index.gps,
+        [str(name) for name in index.names],
+        job.options.georeference,
+        job.seed_for("georeference"),
+    )
+
+
+def _moved(model: Reconstruction, placement: Placement) -> Reconstruction:
+    rotations, translations, points = placement.move(model.rotations, model.translations, model.points)
+    return replace(model, rotations=rotations, translations=translations, points=points)
 
 
 def _all_keypoints(job: StageJob, index: ImageIndex) -> list[np.ndarray] | None:

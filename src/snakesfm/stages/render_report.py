@@ -34,7 +34,15 @@ from snakesfm.reporting.registration import (
     mean_by_image,
     reason_not_registered,
 )
-from snakesfm.reporting.tables import ROUND_HEADS, bundle_rows, image_table, label_counts, metric_tables
+from snakesfm.reporting.tables import (
+    PLACE_HEADS,
+    ROUND_HEADS,
+    bundle_rows,
+    image_table,
+    label_counts,
+    metric_tables,
+    place_rows,
+)
 from snakesfm.stages.job import StageJob
 from snakesfm.tracks.merged import describe_lengths
 
@@ -94,7 +102,7 @@ def run(job: StageJob) -> None:
         stages=_stage_rows(
             index, calibrated, pairs, graph, rotations, tracks, points, model, counts, seconds
         ),
-        tables=_tables(pairs, graph, model, metrics),
+        tables=_tables(pairs, graph, model, summary, metrics),
         histogram=error_histogram(errors),
         histogram_caption=f"Errors of {len(errors):,} observations; the last bar includes the largest 1 %.",
         missing=_missing(index, names, counts, pairs, graph),
@@ -135,7 +143,11 @@ def _counts(
 
 
 def _tables(
-    pairs: Pairs, graph: ViewGraph, model: Reconstruction, metrics: Mapping[str, Any]
+    pairs: Pairs,
+    graph: ViewGraph,
+    model: Reconstruction,
+    summary: Mapping[str, Any],
+    metrics: Mapping[str, Any],
 ) -> list[tuple[str, list[str], Sequence[Sequence[Any]]]]:
     """Title, heads and rows of the tables between those of stages and of images."""
     outcomes = label_counts(pairs.rejections, ("accepted", *REJECTIONS[1:]))
@@ -144,6 +156,7 @@ def _tables(
         ("Pairs", ["outcome", "pairs"], outcomes),
         ("View graph", ["filter", "edges"], label_counts(graph.labels, EDGE_LABELS)),
         ("Bundle adjustment", ROUND_HEADS, rounds),
+        ("Georeference", PLACE_HEADS, place_rows(summary)),
         *metric_tables(metrics),
     ]
 

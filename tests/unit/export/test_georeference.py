@@ -3,13 +3,27 @@
 import numpy as np
 import pycolmap
 import pytest
+from scipy.spatial.transform import Rotation
 
 from snakesfm.evaluation.alignment import project_to_so3
-from snakesfm.export.georeference import georeference
+from snakesfm.export.georeference import Georeference, downward_axes, georeference
 from snakesfm.geometry.earth import local_origin
 from snakesfm.geometry.poses import Similarity
 
 ORIGIN = (47.0, 8.0, 500.0)
+# columns: the camera's axes right, down and forward, in metres east, north and up
+NADIR = np.array([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]])
+LEVEL = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+
+
+def place(centers, gps, origin, seed, rotations=None, orientations=None) -> Georeference | None:
+    """The georeference by cameras whose world is turned as those of a model that GPS is for."""
+    if rotations is None:
+        downward = np.full((len(centers), 3), np.nan)
+    else:
+        ones = np.ones(len(centers), np.int32)
+        downward = downward_axes(rotations, ones if orientations is None else orientations)
+    return georeference(centers, downward, gps, origin, np.arange(len(centers)), seed)
 
 
 def survey(count: int = 60, noise_m: float = 1.5, shape: tuple[float, ...] = (200.0, 100.0, 10.0)):
@@ -28,7 +42,7 @@ def test_the_similarity_is_found_among_wrong_positions():
     gps[:12, :2] += 0.01
     gps[12:15] = np.nan
     centers[15] = np.nan
-    found = georeference(centers, gps, ORIGIN, 0)
+    found = place(centers, gps, ORIGIN, 0)
     assert found.trusted and found.images == 56 and 36 <= found.inliers <= 44
     assert 1.0 < found.median_residual_m < 5.0
     move = found.local_from_model
@@ -40,7 +54,7 @@ def test_the_similarity_is_found_among_wrong_positions():
 def test_good_positions_are_not_blurred_by_bad_ones():
     centers, gps, truth = survey(noise_m=0.02)
     gps[:6, 2] += 8.0
-    move = georeference(centers, gps, ORIGIN, 0).local_from_model
+    move = place(centers, gps, ORIGIN, 0).local_from_model
     np.testing.assert_allclose(
         move.transform_points(centers),
         survey(noise_m=0.0)[0] @ (truth.scale * truth.rotation.T) + truth.translation,
@@ -53,7 +67,7 @@ def test_good_positions_are_not_blurred_by_bad_ones():
 )
 def test_an_object_smaller_than_the_error_or_a_line_is_not_trusted(noise_m, shape):
     centers, gps, _ = survey(noise_m=noise_m, shape=shape)
-    found = georeference(centers, gps, ORIGIN, 0)
+    found = place(centers, gps, ORIGIN, 0)
     assert found is None or not found.trusted
 
 
@@ -68,7 +82,7 @@ def test_a_wrong_position_beside_a_line_does_not_make_it_an_area(seed, wrong):
         noisy = local + rng.normal(size=(20, 3)) * 1.5
         noisy[7] += wrong
         gps = pycolmap.GPSTransform().enu_to_ellipsoid(noisy, *ORIGIN)
-        found = georeference(centers, gps, local_origin(gps), 0)
+        found = place(centers, gps, local_origin(gps), 0)
         assert found.trusted == trusted
         assert found.inliers == 19
         assert 1.0 < found.median_residual_m < 3.5
@@ -79,7 +93,7 @@ def test_a_wrong_position_beside_a_line_does_not_make_it_an_area(seed, wrong):
 def test_few_positions_tell_nothing():
     centers, gps, _ = survey()
     gps[3:] = np.nan
-    assert georeference(centers, gps, ORIGIN, 0) is None
+    assert place(centers, gps, ORIGIN, 0) is None
     assert local_origin(np.full((4, 3), np.nan)) is None
 
 
@@ -92,7 +106,7 @@ def test_the_origin_is_the_middle_and_the_result_is_that_of_the_seed():
         off = (local_origin(moved)[1] - east + 180.0) % 360.0 - 180.0
         assert abs(off) < 1e-3
         assert -180.0 <= local_origin(moved)[1] < 180.0
-    first, second = (georeference(centers, gps, ORIGIN, 7).local_from_model for _ in range(2))
+    first, second = (place(centers, gps, ORIGIN, 7).local_from_model for _ in range(2))
     np.testing.assert_array_equal(first.rotation, second.rotation)
     assert first.scale == second.scale
 
@@ -100,6 +114,56 @@ def test_the_origin_is_the_middle_and_the_result_is_that_of_the_seed():
 def test_positions_that_agree_with_nothing_are_no_inliers():
     centers, gps, _ = survey(count=12)
     gps[6:] += [-30.0, 60.0, 0.0]
-    found = georeference(centers, gps, ORIGIN, 0)
+    found = place(centers, gps, ORIGIN, 0)
     # six of them agree with each other, all twelve with nothing
     assert found is None or (found.inliers <= 6 and found.median_residual_m < 20.0)
+
+
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("kind", ["nadir", "oblique", "level", "portrait"])
+def test_positions_in_the_wrong_hemisphere_do_not_turn_a_model_upside_down(kind, seed):
+    rng = np.random.default_rng(seed)
+    x, y = np.meshgrid(25.0 * np.arange(9), 30.0 * np.arange(7))
+    local = np.column_stack([x.ravel(), y.ravel(), np.zeros(63)]) + rng.normal(size=(63, 3)) * 0.5
+    turn = project_to_so3(rng.normal(size=(3, 3)))
+    tilt = Rotation.from_euler("x", -40.0, degrees=True).as_matrix()
+    camera = {"nadir": NADIR, "oblique": LEVEL @ tilt, "level": LEVEL, "portrait": LEVEL}[kind]
+    # portraits are stored with the upper side to the left, or to the right
+    orientations = rng.choice([6, 8], 63) if kind == "portrait" else np.ones(63, np.int32)
+    rolls = np.select([orientations == 6, orientations == 8], [90.0, -90.0])
+    # flights go to and fro, and people turn about
+    yaw = Rotation.from_euler("z", rng.choice([0.0, 180.0], (63, 1)), degrees=True).as_matrix()
+    roll = Rotation.from_euler("z", rolls[:, None], degrees=True).as_matrix()
+    shake = Rotation.from_rotvec(rng.normal(size=(63, 3)) * 0.05).as_matrix()
+    world_from_cam = yaw @ camera @ roll @ shake
+    # cam_from_model, of a model that is turned and ten times as small
+    rotations = world_from_cam.transpose(0, 2, 1) @ turn
+    centers = 0.1 * local @ turn
+    gps = pycolmap.GPSTransform().enu_to_ellipsoid(local + rng.normal(size=(63, 3)) * 0.5, *ORIGIN)
+    right = place(centers, gps, local_origin(gps), 0, rotations, orientations)
+    assert right.trusted and right.inliers >= 60 and -1.5 < right.upward < -0.8
+    for column in (0, 1):
+        mirrored = np.array(gps)
+        mirrored[:, column] *= -1.0
+        wrong = place(centers, mirrored, local_origin(mirrored), 0, rotations, orientations)
+        assert wrong.inliers >= 60 and 0.8 < wrong.upward < 1.5
+        assert not wrong.trusted and "GPSLongitudeRef" in wrong.refusal
+
+
+@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("scattered", [True, False])
+def test_a_majority_of_good_positions_is_told_from_a_receiver_that_froze(scattered, seed):
+    rng = np.random.default_rng(seed)
+    x, y = np.meshgrid(25.0 * np.arange(10), 30.0 * np.arange(8))
+    local = np.column_stack([x.ravel(), y.ravel(), np.zeros(80)]) + rng.normal(size=(80, 3)) * 0.3
+    turn = project_to_so3(rng.normal(size=(3, 3)))
+    noisy = local + rng.normal(size=local.shape) * 0.5
+    # towards the end, the good positions cover only a part
+    frozen = rng.permutation(80)[:30] if scattered else np.arange(50, 80)
+    noisy[frozen] = noisy[frozen[0]]
+    gps = pycolmap.GPSTransform().enu_to_ellipsoid(noisy, *ORIGIN)
+    found = place(0.1 * local @ turn, gps, local_origin(gps), 0)
+    assert found.trusted and 49 <= found.inliers <= 53
+    assert 0.4 < found.median_residual_m < 1.5
+    np.testing.assert_allclose(found.local_from_model.rotation @ turn.T, np.eye(3), atol=0.02)
+    np.testing.assert_allclose(found.local_from_model.scale, 10.0, rtol=0.01)

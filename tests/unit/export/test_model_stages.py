@@ -2,6 +2,7 @@
 
 import csv
 import dataclasses
+import html
 import json
 import struct
 import sys
@@ -33,6 +34,7 @@ from snakesfm.config.render_report import RenderReportOptions
 from snakesfm.evaluation.colmap_model import read_model
 from snakesfm.export.undistorted import write_undistorted
 from snakesfm.geometry.camera import Camera, cameras_to_columns
+from snakesfm.geometry.earth import local_metres, local_origin
 from snakesfm.job_logs import describe_cost
 from snakesfm.stages import evaluate_model, export_model, render_report
 from snakesfm.stages.job import StageJob
@@ -105,11 +107,20 @@ def write_reconstruction(
     lost: Iterable[int] = (LOST,),
     reset: str = "",
     offset: float = np.nan,
+    second: Iterable[int] = (),
 ) -> Path:
-    """The truth as a finished model, ``lost`` images not registered; what is wrong with the second camera."""
+    """The truth as a finished model, ``lost`` images not registered, those of a ``second`` model apart.
+
+    Also what is wrong with the second camera.
+    """
     rotations, translations = problem.rotations.copy(), problem.translations.copy()
     rotations[list(lost)], translations[list(lost)] = np.nan, np.nan
     keep = ~np.isin(problem.track_image_ids, list(lost))
+    model_of = np.isin(np.arange(COUNT), list(second)).astype(np.int32)
+    if model_of.any():
+        # every other point is of the second model
+        point_of = np.repeat(np.arange(len(problem.points)), np.diff(problem.track_offsets))
+        keep &= model_of[problem.track_image_ids] == point_of % 2
     lengths = np.add.reduceat(keep.astype(int), problem.track_offsets[:-1])
     seen = lengths > 0
     models, sizes, params, _ = cameras_to_columns([CAMERA, CAMERA])
@@ -122,7 +133,7 @@ def write_reconstruction(
         camera_offsets=np.array([np.nan, offset]),
         rotations=rotations,
         translations=translations,
-        models=np.where(np.isin(np.arange(COUNT), list(lost)), -1, 0),
+        models=np.where(np.isin(np.arange(COUNT), list(lost)), -1, model_of),
         points=problem.points[seen],
         colors=np.arange(count * 3).reshape(-1, 3).astype(np.uint8),
         errors_px=np.linspace(0.1, 0.5, count),
@@ -175,13 +186,14 @@ def export(
     masks: Path | None = None,
     reset: str = "",
     offset: float = np.nan,
+    second: Iterable[int] = (),
     **options: bool,
 ) -> Path:
     inputs = {
         "index": str(write_index(tmp_path, orientations, gps)),
         "cameras": str(write_cameras(tmp_path)),
         "features": [str(write_features(tmp_path, problem))],
-        "reconstruction": str(write_reconstruction(tmp_path, problem, lost, reset, offset)),
+        "reconstruction": str(write_reconstruction(tmp_path, problem, lost, reset, offset, second)),
     }
     folder = tmp_path / "out" / "scene" / "export_model"
     images = tmp_path / "photos"
@@ -337,18 +349,130 @@ def test_the_world_stays_where_positions_contradict_it_or_are_not_wanted(tmp_pat
         folder = export(tmp_path / name, problem, gps=gps_of(problem, noise), **options)
         assert (folder / "sparse/0/images.bin").read_bytes() == without
         assert json.loads((folder / "summary.json").read_text())["georeference"] is None
-    asked = export(tmp_path / "asked", problem, georeference=True)
-    summary = json.loads((asked / "summary.json").read_text())
-    assert summary["georeference"] is None
-    assert any("GPS in EXIF" in line for line in summary["warnings"])
-    gps = gps_of(problem, 0.5)
+    for unused in (plain, folder):
+        summary = json.loads((unused / "summary.json").read_text())
+        assert summary["georeference_refused"] is None
+        assert not any("georeference" in line for line in summary["warnings"])
+
+
+def few_positions(gps: np.ndarray) -> None:
+    gps[3:] = np.nan
+
+
+def no_altitudes(gps: np.ndarray) -> None:
     gps[3:, 2] = np.nan
-    flat = export(tmp_path / "flat", problem, gps=gps, georeference=True)
-    summary = json.loads((flat / "summary.json").read_text())
+
+
+def of_the_lost_image(gps: np.ndarray) -> None:
+    gps[np.arange(COUNT) != LOST] = np.nan
+
+
+def in_another_order(gps: np.ndarray) -> None:
+    gps[:LOST] = gps[np.random.default_rng(0).permutation(LOST)]
+
+
+def within_a_metre(gps: np.ndarray) -> None:
+    gps[:] = pycolmap.GPSTransform().enu_to_ellipsoid(
+        0.02 * pycolmap.GPSTransform().ellipsoid_to_enu(gps, 47.0, 8.0, 500.0)
+        + np.random.default_rng(2).normal(size=gps.shape) * 0.9,
+        47.0,
+        8.0,
+        500.0,
+    )
+
+
+@pytest.mark.parametrize(
+    ("damage", "reason"),
+    [
+        (few_positions, "only 3 images of the model have GPS in EXIF, and 4 are needed"),
+        # of nine images one is not registered
+        (
+            no_altitudes,
+            "5 images of the model have GPS without altitude in EXIF, and fewer than four with it",
+        ),
+        (of_the_lost_image, "no image of the model has GPS in EXIF"),
+        (in_another_order, "of 8 positions agree with the model"),
+        (within_a_metre, "the positions spread over only"),
+    ],
+)
+def test_why_positions_are_not_used_is_said_everywhere(tmp_path, problem, damage, reason) -> None:
+    gps = gps_of(problem, 0.1)
+    damage(gps)
+    folder = export(tmp_path, problem, gps=gps)
+    summary = json.loads((folder / "summary.json").read_text())
     assert summary["georeference"] is None
-    # of nine images one is not registered
+    assert reason in summary["georeference_refused"]
+    (line,) = (line for line in summary["warnings"] if "georeferenced" in line)
+    assert line == (
+        f"The model is not georeferenced by the GPS positions in EXIF: {summary['georeference_refused']}."
+    )
+    assert html.escape(reason) in report(tmp_path, problem, "", summary=summary)
+    wanted = export(tmp_path / "wanted", problem, gps=gps, georeference=True)
+    summary = json.loads((wanted / "summary.json").read_text())
     (line,) = (line for line in summary["warnings"] if "georeference is true" in line)
-    assert "but 5 registered images have GPS without altitude" in line and "GPSAltitude" in line
+    assert reason in line
+    used = damage in (in_another_order, within_a_metre)
+    assert (summary["georeference"] is not None) == used == (summary["georeference_refused"] is None)
+
+
+@pytest.mark.parametrize(
+    ("without", "sentence"),
+    [
+        (
+            (),
+            "in folders next to sparse/0, all in metres east, north and up from the origin in summary.json.",
+        ),
+        ((0, 1, 2, 3), "summary.json (georeference_of_models): sparse/1."),
+        ((4, 5, 6, 7), "summary.json (georeference_of_models): sparse/0."),
+        (range(8), "in folders next to sparse/0, each in its own coordinate frame."),
+    ],
+)
+def test_it_is_told_which_of_separate_models_are_georeferenced(
+    tmp_path, problem, without, sentence
+) -> None:
+    gps = gps_of(problem, 0.05)
+    gps[list(without)] = np.nan
+    folder = export(tmp_path, problem, gps=gps, second=(4, 5, 6, 7))
+    summary = json.loads((folder / "summary.json").read_text())
+    first, second = summary["georeference_of_models"]
+    assert summary["georeference"] == first
+    assert (first is None) == (0 in without)
+    assert (second is None) == (4 in without)
+    (line,) = (line for line in summary["warnings"] if "could not be connected" in line)
+    assert line.startswith("4 images could not be connected") and line.endswith(sentence)
+    origin = local_origin(gps)
+    page = report(tmp_path, problem, "", summary=summary)
+    for number, place in enumerate((first, second)):
+        assert (f"<td>sparse/{number}</td>" in page) == (place is not None)
+        if place is None:
+            continue
+        assert place["origin_latitude_longitude_altitude"] == list(origin)
+        assert (place["images_with_position"], place["inliers"]) == (4, 4)
+        model = read_model(folder / "sparse" / str(number))
+        places = local_metres(gps, origin)
+        for image in model.images.values():
+            assert np.linalg.norm(image.projection_center() - places[image.image_id - 1]) < 1.0
+
+
+def test_where_no_image_has_gps_that_is_said_only_if_it_is_wanted(tmp_path, problem) -> None:
+    asked = export(tmp_path, problem, georeference=True)
+    summary = json.loads((asked / "summary.json").read_text())
+    assert summary["georeference_refused"] == "no image of the model has GPS in EXIF"
+    assert any("georeference is true, but" in line for line in summary["warnings"])
+
+
+def test_the_report_says_where_the_model_is(tmp_path, problem) -> None:
+    folder = export(tmp_path, problem, gps=gps_of(problem, 0.5))
+    summary = json.loads((folder / "summary.json").read_text())
+    page = report(tmp_path, problem, "", summary=summary)
+    latitude, longitude, altitude = summary["georeference"]["origin_latitude_longitude_altitude"]
+    assert f"{latitude:.6f}, {longitude:.6f}, {altitude:.2f} m" in page
+    assert "<h2>Georeference</h2>" in page
+    for kind in ("", "horizontal_", "vertical_"):
+        residual = summary["georeference"][f"median_{kind}residual_m"]
+        assert 0.05 < residual < 2.0
+        assert f"{residual:.4g}" in page
+    assert "<h2>Georeference</h2>" not in report(tmp_path / "none", problem, "")
 
 
 def test_images_are_one_relative_link_and_a_second_run_gives_the_same_bytes(tmp_path, problem) -> None:
@@ -654,12 +778,13 @@ def report(
     problem: SyntheticProblem,
     reference: str,
     lost: Iterable[int] = (LOST,),
+    summary: dict[str, object] | None = None,
     **options: int,
 ) -> str:
     evaluate(tmp_path, problem, reference, lost)
     inputs = write_former_stages(tmp_path, problem)
     inputs["metrics"] = str(tmp_path / "evaluate_model" / "metrics.json")
-    write_json(tmp_path / "summary.json", {"warnings": ["camera 1: look <here>"]})
+    write_json(tmp_path / "summary.json", summary or {"warnings": ["camera 1: look <here>"]})
     inputs["summary"] = str(tmp_path / "summary.json")
     output = tmp_path / "render_report" / "index.html"
     render_report.run(

@@ -46,6 +46,8 @@ def test_place_with_signs(tmp_path):
         ExifTags.GPS.GPSAltitude: IFDRational(125, 10),
     }
     np.testing.assert_allclose(write(tmp_path / "a.jpg", place=south_west).gps, (-33.505, -70.75, -12.5))
+    words = south_west | {ExifTags.GPS.GPSLatitudeRef: "South", ExifTags.GPS.GPSLongitudeRef: " west"}
+    np.testing.assert_allclose(write(tmp_path / "w.jpg", place=words).gps, (-33.505, -70.75, -12.5))
     nowhere = south_west | {
         ExifTags.GPS.GPSLatitude: (IFDRational(0),) * 3,
         ExifTags.GPS.GPSLongitude: (IFDRational(0),) * 3,
