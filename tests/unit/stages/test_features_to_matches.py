@@ -1,6 +1,6 @@
 """From images to matches by the stages themselves, on rendered images."""
 
-from pathlib import Path
+import shutil
 
 import cv2
 import h5py
@@ -24,6 +24,8 @@ from snakesfm.config.match_pairs import MatchPairsOptions
 from snakesfm.config.select_pairs import SelectPairsOptions
 from snakesfm.errors import ConfigError
 from snakesfm.geometry.camera import PARAM_SLOTS
+from snakesfm.ingest.discover import digest_images
+from snakesfm.ingest.indexed import IndexedImages
 from snakesfm.stages import describe_images, extract_features, learn_vocabulary, match_pairs, select_pairs
 from snakesfm.stages.job import StageJob
 
@@ -66,13 +68,13 @@ def images(tmp_path_factory):
 class Scene:
     """The stages from index to matches, in one folder, with a number of blocks."""
 
-    def __init__(self, folder, images, blocks, shas=None, gps=None, copies=()):
+    def __init__(self, folder, images, blocks, gps=None, copies=()):
         self.folder, self.images, self.blocks = folder, images, blocks
         count = len(NAMES)
         index = ImageIndex(
             names=NAMES,
             sizes=np.tile([320, 240], (count, 1)),
-            sha256=shas or [f"sha of {name}" for name in NAMES],
+            sha256=list(digest_images(images, NAMES).values()),
             blocks=deal_blocks(NAMES, blocks),
             camera_ids=np.zeros(count, int),
             orientations=np.ones(count, int),
@@ -369,16 +371,17 @@ def test_matches_are_right_and_do_not_depend_on_the_blocks(whole, dealt):
 def test_unchanged_images_and_pairs_are_taken_over(dealt, images, tmp_path, monkeypatch, capsys):
     dealt.select(SelectPairsOptions())
     before = dealt.match()
-    shas = [f"sha of {name}" for name in NAMES]
-    shas[4] = "another"
-    scene = Scene(tmp_path, images, 3, shas)
+    changed = shutil.copytree(images, tmp_path / "images")
+    with (changed / "other.png").open("ab") as file:
+        file.write(b"behind the image")
+    scene = Scene(tmp_path, changed, 3)
     read = []
-    original = extract_features.read_image
+    original = IndexedImages.read
     monkeypatch.setattr(
-        extract_features, "read_image", lambda path, side: read.append(path) or original(path, side)
+        IndexedImages, "read", lambda self, row, side: read.append(NAMES[row]) or original(self, row, side)
     )
     scene.extract(former=dealt)
-    assert [Path(path).name for path in read] == ["other.png"]
+    assert read == ["other.png"]
     scene.select(SelectPairsOptions())
     capsys.readouterr()
     after = scene.match(former=dealt)
