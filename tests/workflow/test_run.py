@@ -118,6 +118,32 @@ def test_a_deleted_tile_is_made_again_with_what_depends_on_it_alone(
     assert re.search(r"([1-9]\d*) pairs \(\1 taken over\)", log)
 
 
+def test_a_lost_model_or_table_or_link_to_the_images_is_made_again(
+    finished, small_scene: Path, workflow
+) -> None:
+    copy_run(finished[0], workflow.folder)
+    output = workflow.folder / "out" / "square"
+    shutil.rmtree(output / "export_model" / "sparse")
+    (output / "evaluate_model" / "metrics.csv").unlink()
+    outcome = workflow.run(*config_of(small_scene))
+    assert outcome.status == 0, outcome.text
+    assert sorted(outcome.rules) == ["evaluate_model", "export_model", "render_report"]
+    assert model_bytes(output) == model_bytes(finished[0])
+    assert (output / "evaluate_model" / "metrics.csv").is_file()
+    # moved to another depth, a relative link leads nowhere
+    moved = Workflow(workflow.folder / "deep" / "er")
+    moved.folder.mkdir(parents=True)
+    for name in ("out", ".snakemake"):
+        (workflow.folder / name).rename(moved.folder / name)
+    images = moved.folder / "out" / "square" / "export_model" / "images"
+    assert not images.exists()
+    again = moved.run(*config_of(small_scene))
+    assert again.status == 0, again.text
+    assert sorted(again.rules) == ["export_model", "render_report"]
+    assert images.resolve() == (small_scene / "images").resolve()
+    assert moved.run(*config_of(small_scene)).rules == []
+
+
 def test_an_option_reaches_its_stage_and_what_follows_alone(finished, small_scene: Path, workflow) -> None:
     copy_run(finished[0], workflow.folder)
     outcome = workflow.run("--dry-run", *config_of(small_scene), "adjust_bundle={max_iterations: 77}")
