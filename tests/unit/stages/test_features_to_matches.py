@@ -17,6 +17,7 @@ from snakesfm.artifacts import (
     Vocabulary,
 )
 from snakesfm.blocks import deal_blocks
+from snakesfm.cache import cached_path, share
 from snakesfm.config.describe_images import DescribeImagesOptions
 from snakesfm.config.extract_features import ExtractFeaturesOptions
 from snakesfm.config.learn_vocabulary import LearnVocabularyOptions
@@ -402,6 +403,46 @@ def test_other_options_or_a_damaged_former_file_take_nothing_over(dealt, images,
     other = Scene(tmp_path / "again", images, 3)
     other.extract(former=scene)
     assert all(len(points["keypoints"]) <= 400 for points in other.features().values())
+
+
+@pytest.mark.parametrize("damage", ["columns", "attributes", "groups", "pages"])
+def test_a_damaged_former_or_shared_file_costs_time_alone(images, tmp_path, capsys, monkeypatch, damage):
+    """What h5py raises is of many kinds."""
+    monkeypatch.setenv("SNAKESFM_CACHE", str(tmp_path / "shared"))
+    scene = Scene(tmp_path, images, 1)
+    scene.extract()
+    (made,) = scene.block_files("features")
+    digests = LocalFeatures.read(made).digests
+    whole = made.read_bytes()
+    cached = cached_path("extract_features", digests)
+    former = tmp_path / "former.h5"
+    former.write_bytes(whole)
+    if damage == "pages":
+        former.write_bytes(whole[:2000] + b"\xff" * 3000 + whole[5000:])
+    else:
+        with h5py.File(former, "r+") as file:
+            if damage == "attributes":
+                file.attrs["checksum"] = "none"
+            elif damage == "columns":
+                del file["offsets"]
+                file["offsets"] = np.arange(3, dtype=float)
+            else:
+                del file["digests"]
+                file.create_group("digests")
+    cached.parent.mkdir(parents=True)
+    cached.write_bytes(former.read_bytes())
+    options = ExtractFeaturesOptions(max_keypoints=400)
+    settings = {"images": str(images), "block": 0}
+    inputs, again = {"index": scene.file("index")}, tmp_path / "again.h5"
+    capsys.readouterr()
+    extract_features.run(scene.job("extract_features", options, inputs, [again], former, **settings))
+    assert "6 images (0 taken over)" in capsys.readouterr().out
+    assert not cached.exists()
+    np.testing.assert_array_equal(LocalFeatures.read(again).keypoints, LocalFeatures.read(made).keypoints)
+    share(again, cached)
+    extract_features.run(scene.job("extract_features", options, inputs, [made], None, **settings))
+    assert "6 images (6 taken over)" in capsys.readouterr().out
+    assert cached.exists()
 
 
 def newer(kind, **options):
