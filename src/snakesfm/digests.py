@@ -14,7 +14,6 @@ UNTOLD = frozenset(
         "images_target",
         "cameras",
         "masks",
-        "masks_content",
         "pairs_file",
         "reference",
         "imported",

@@ -25,7 +25,7 @@ from snakesfm.front_ends import (
 )
 from snakesfm.geometry.detector_sides import LONGER_SIDE, SHORTER_SIDE
 from snakesfm.hloc_files import FEATURES, MATCHES, PAIRS
-from snakesfm.ingest.discover import count_images, fingerprint_images
+from snakesfm.ingest.discover import MASK_DIGESTS_NAME, count_images, fingerprint_images
 from snakesfm.model_files import MODEL_FILES
 from snakesfm.pair_lists import estimate_pair_count, find_pair_list, pair_list_state
 from snakesfm.resources import Load, job_load
@@ -303,7 +303,7 @@ class ScenePlan:
 
     @functools.cached_property
     def _mask_fingerprint(self) -> str:
-        return fingerprint_images(self.masks, self.folder / "index_images" / "mask_digests.json")
+        return fingerprint_images(self.masks, self.folder / "index_images" / MASK_DIGESTS_NAME)
 
     def settings(self, stage: str, wildcards: Mapping[str, str], main_process: bool) -> dict[str, Any]:
         """What a stage is told beside its options."""

@@ -159,6 +159,7 @@ def test_masked_parts_of_images_take_no_part(finished, small_scene: Path, workfl
         mask = np.full((300, 400), 255, np.uint8)
         mask[:, 200:] = 0
         cv2.imwrite(str(masks / f"{name}.png"), mask)
+    output = workflow.folder / "out" / "square"
     outcome = workflow.run(*config_of(small_scene), "masks=masks")
     assert outcome.status == 0, outcome.text
     assert "index_images" not in outcome.rules and "extract_features" in outcome.rules
@@ -171,6 +172,20 @@ def test_masked_parts_of_images_take_no_part(finished, small_scene: Path, workfl
     assert re.search(r"(\d+) images \(\d taken over\), \d+ of them with masks", log)
     again = workflow.run(*config_of(small_scene), "masks=masks")
     assert again.status == 0 and again.rules == [], again.text
+    # they are told by content where there is no record, too
+    for changed, made in ((False, 0), (True, len(list((output / "extract_features").glob("*.h5"))))):
+        shutil.rmtree(workflow.folder / ".snakemake")
+        if changed:
+            cv2.imwrite(str(masks / f"{names[0]}.png"), mask[:, ::-1])
+        unrecorded = workflow.run("--until", "extract_features", *config_of(small_scene), "masks=masks")
+        assert unrecorded.status == 0, unrecorded.text
+        assert unrecorded.rules.count("extract_features") == made
+        assert len(list(output.rglob("*.refused"))) == made
+        assert unrecorded.rules.count("index_images") == 0
+    features = [LocalFeatures.read(path) for path in (output / "extract_features").glob("*.h5")]
+    (first,) = [part for part in features if names[0] in part.names]
+    row = list(first.names).index(names[0])
+    assert first.keypoints[first.offsets[row] : first.offsets[row + 1], 0].min() >= 200
 
 
 def test_a_folder_without_records_is_taken_over_unless_its_options_differ(

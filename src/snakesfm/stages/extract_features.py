@@ -23,6 +23,7 @@ from snakesfm.errors import ConfigError
 from snakesfm.features.extraction import DETECTORS, extract_keypoints, sample_colors
 from snakesfm.features.keypoints import Detector, KeypointSet, KeypointSource
 from snakesfm.hloc_files import FEATURES
+from snakesfm.ingest.discover import MASK_DIGESTS_NAME, fingerprint_images
 from snakesfm.ingest.indexed import IndexedImages
 from snakesfm.ingest.masks import find_mask, read_mask
 from snakesfm.ingest.read import ImagePixels
@@ -64,6 +65,8 @@ def run(job: StageJob) -> None:
     finder = _create_finder(job, options)
     beside = job.weights_digest() + str(job.settings.get("source_content", ""))
     names = [str(name) for name in index.names[rows]]
+    # before they are read, so that a mask that changes meanwhile is noticed
+    told = _told_of_masks(job)
     masks = _find_masks(job, names)
     contents = {name: file_digest(str(path)) for name, path in masks.items()}
     # known keypoints are found by the image's name
@@ -86,7 +89,7 @@ def run(job: StageJob) -> None:
         results |= zip(places, _extract(images, seen, wanted, finder, options), strict=True)
         progress.step(len(places))
     ordered = [results[place] for place in range(len(rows))]
-    _collect(index, rows, digests, ordered, finder).write(job.output, job.header)
+    _collect(index, rows, digests, ordered, finder).write(job.output, told.header)
     pictures.warn_of_damaged(job)
     counts = [len(result.points) for result in ordered]
     reused = sum(digest in former for digest in digests)
@@ -103,6 +106,15 @@ def _find_masks(job: StageJob, names: Sequence[str]) -> dict[str, Path]:
         return {}
     found = {name: find_mask(Path(job.settings["masks"]), name) for name in names}
     return {name: mask for name, mask in found.items() if mask is not None}
+
+
+def _told_of_masks(job: StageJob) -> StageJob:
+    """The job with what only the controller compares: the content of all masks, if there are any."""
+    if not job.settings.get("masks"):
+        return job
+    cache_file = job.path("index").with_name(MASK_DIGESTS_NAME)
+    content = fingerprint_images(Path(job.settings["masks"]), cache_file)
+    return replace(job, settings={**job.settings, "masks_content": content})
 
 
 def _create_finder(job: StageJob, options: "ExtractFeaturesOptions") -> Detector | KeypointSource:
