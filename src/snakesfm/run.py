@@ -226,9 +226,10 @@ class Run:
             if log.stat().st_mtime < self.started:
                 continue
             lines = log.read_text("utf-8", errors="replace").splitlines()
+            # one that is killed before its first line leaves an empty log
             if lines and lines[-1].startswith("error: "):
                 sentences.append(f"{lines[-1].removeprefix('error: ')} (log: {log})")
-            elif lines and not find_cost(lines[-1]):
+            elif not lines or not find_cost(lines[-1]):
                 sentences.append(
                     f"{log.parent.name} {log.stem} was killed from outside (out of memory, time limit, "
                     f"cancelled, or its node failed) (log: {log})"
