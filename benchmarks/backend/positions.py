@@ -6,21 +6,25 @@ import numpy as np
 
 from benchmarks.backend.problems import Problem
 from snakesfm.arrays import Array
+from snakesfm.config.average_translations import AverageTranslationsOptions
 from snakesfm.rotation_averaging.base import edge_residuals
 from snakesfm.rotation_averaging.rejection import residual_limit
+from snakesfm.stages.average_translations import positioning_settings, translation_averager
 from snakesfm.translation_averaging.average import average_translations
-from snakesfm.translation_averaging.averagers import GlobalPositioning, ScaleChain, TranslationRecovery
+from snakesfm.translation_averaging.averagers import GlobalPositioning
 from snakesfm.translation_averaging.problem import (
     PositioningProblem,
     direction_sigmas,
     edge_directions,
     world_rays,
 )
-from snakesfm.translation_averaging.support import SupportLimits
 
 COLMAP_LOSS_SCALE = 0.1
 COLMAP_MIN_VIEWS = 3
 ALL_RAYS = 1 << 40
+# whether restarts help is no question here
+CHAIN = AverageTranslationsOptions(method="scale_chain", restarts=0)
+RECOVERY = AverageTranslationsOptions(method="translation_recovery")
 
 
 def pose_positioning(problem: Problem, averaged: Array) -> PositioningProblem:
@@ -46,20 +50,20 @@ def pose_positioning(problem: Problem, averaged: Array) -> PositioningProblem:
 
 def chain_refined(problem: PositioningProblem, seed: int) -> Array:
     """What stage average_translations does with its defaults."""
-    return average_translations(problem, ScaleChain(), SupportLimits(), seed=seed).centers
+    return average_translations(problem, positioning_settings(CHAIN, seed)).centers
 
 
 def position_as_colmap(problem: PositioningProblem, seed: int) -> Array:
     """Pycolmap's global positioning with its default options: from random places, all longer tracks."""
     views = np.bincount(problem.ray_tracks)
     long = problem.select_rays(views[problem.ray_tracks] >= COLMAP_MIN_VIEWS)
-    return GlobalPositioning(ALL_RAYS, COLMAP_LOSS_SCALE).position(long, seed)
+    return GlobalPositioning(ALL_RAYS, COLMAP_LOSS_SCALE, start=None).position(long, seed)
 
 
 POSITIONS: dict[str, Callable[[PositioningProblem, int], Array]] = {
     "scale_chain": chain_refined,
-    "scale_chain, not refined": lambda problem, seed: ScaleChain().position(problem, seed),
-    "translation_recovery": lambda problem, seed: TranslationRecovery().position(problem, seed),
+    "scale_chain, not refined": translation_averager(CHAIN).position,
+    "translation_recovery": translation_averager(RECOVERY).position,
     "global_positioning": position_as_colmap,
 }
 """snakesfm's default is ``scale_chain``, the paper's ``translation_recovery``, GLOMAP's the last."""

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.compare.measure import Cost
+from snakesfm.config.evaluate_model import EvaluateModelOptions
 from snakesfm.evaluation.colmap_model import model_poses, read_model
 from snakesfm.evaluation.metrics import evaluate_poses, model_metrics
 from snakesfm.grouping import offsets_of
@@ -101,5 +102,6 @@ def evaluate(model_folder: Path, reference: Path) -> dict[str, Any]:
     offsets = offsets_of([point.track.length() for point in points])
     registered = np.array([image.has_pose for image in model.images.values()], dtype=bool)
     errors_px = np.array([point.error for point in points], dtype=np.float64)
-    evaluation = evaluate_poses(model_poses(model), model_poses(read_model(reference)))
+    defaults = EvaluateModelOptions().model_dump()
+    evaluation = evaluate_poses(model_poses(model), model_poses(read_model(reference)), **defaults)
     return {**model_metrics(registered, offsets, errors_px), **evaluation.metrics}

@@ -92,7 +92,7 @@ class Campaign:
         front = work / "colmap"
         inputs = version("pycolmap")
         runs = [replace(blank, method=m, seed=s, inputs=inputs) for s in seeds for m in peers]
-        if all(self._taken_over(result) for result in runs):
+        if all(self.takes_over(result) for result in runs):
             return
         try:
             costs = methods.colmap_front_end(image_set, front, self.threads, self.limit_s)
@@ -151,13 +151,14 @@ class Campaign:
 
         self._measure(image_set, result, folder / "model", run)
 
-    def _taken_over(self, result: Result) -> bool:
+    def takes_over(self, result: Result) -> bool:
+        """Whether a result is stored that may stand for this run."""
         stored = result.stored(self.results)
         return stored is not None and (stored.undisturbed or not self.retime or result.seed > 0)
 
     def _measure(self, image_set: ImageSet, result: Result, model: Path, run: Callable[[], Costs]) -> None:
         """Run, evaluate and store, unless that is stored already; a failure is stored too."""
-        if self._taken_over(result):
+        if self.takes_over(result):
             return
         result = replace(result, date=datetime.now(UTC).strftime("%Y-%m-%d"))
         try:

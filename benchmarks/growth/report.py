@@ -59,7 +59,8 @@ Machine: {os.cpu_count()} cores ({platform.machine()}), {memory_gb:.0f} GB. {lib
 Python {platform.python_version()}.
 
 The scenes are simulated by `python -m snakesfm.simulate`: features and matches of known truth with
-keypoint noise, clutter, look-alikes and copied structures, no images. The workflow runs on from the
+keypoint noise, clutter, look-alikes and copied structures, no images; so `adjust_bundle` does not refine
+keypoints, which takes 0.03 s per image, and 0.2 s more to decode one of 20 megapixels. The workflow runs on from the
 artifacts of the stage named in "from". Seconds are processor seconds of one core, from the logs of the
 jobs, so that other work on the machine does not count but for the caches that it takes; memory is the
 largest of a stage's jobs. The exponent p of cost ~ images^p is fitted to runs of {LEAST_IMAGES} images or

@@ -3,9 +3,11 @@
 import functools
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
+
+from snakesfm.given_files import find_cameras_file, list_model_files
 
 # where things are, and what only the controller reads
 UNTOLD = frozenset(
@@ -35,25 +37,39 @@ def settings_text(settings: Mapping[str, Any], seed: int) -> str:
     return json.dumps(told | {"seed": seed}, sort_keys=True)
 
 
+def sha256_of(path: Path) -> str:
+    """SHA-256 of a file's content, which is read in chunks, hexadecimal."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
 @functools.cache
 def file_digest(path: str, *beside: str) -> str:
-    """SHA-256 of a small file, or of the cameras, images and points files of a folder; '' for no path.
+    """SHA-256 of a file's name and content, or of the known cameras in a folder; '' for no path.
 
     Parameters
     ----------
     path : the file or folder.
-    beside : names of files that count as well where they lie beside a file.
+    beside : names of files that count as well where they lie beside the file.
     """
-    if not path:
+    file = find_cameras_file(Path(path).expanduser()) if path else None
+    if file is None:
         return ""
-    root = Path(path).expanduser()
-    if root.is_file():
-        files = [root, *(other for name in beside if (other := root.with_name(name)).is_file())]
-    else:
-        files = sorted(p for p in root.rglob("*") if p.suffix in {".txt", ".bin"})
+    return _digest([file, *(other for name in beside if (other := file.with_name(name)).is_file())])
+
+
+@functools.cache
+def model_digest(folder: str) -> str:
+    """SHA-256 of the names and contents of the COLMAP model that a folder holds; '' for no path."""
+    return _digest(list_model_files(Path(folder).expanduser())) if folder else ""
+
+
+def _digest(files: Iterable[Path]) -> str:
     digest = hashlib.sha256()
-    for file in files:
-        digest.update(file.name.encode() + b"\0" + file.read_bytes())
+    for path in files:
+        digest.update(path.name.encode() + b"\0")
+        with path.open("rb") as file:
+            hashlib.file_digest(file, lambda: digest)
     return digest.hexdigest()
 
 

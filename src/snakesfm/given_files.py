@@ -7,6 +7,8 @@ import struct
 from pathlib import Path
 
 MODEL_PARTS = ("cameras", "images", "points3D")
+# beside them since COLMAP 3.12
+LATER_PARTS = ("frames", "rigs")
 MODEL_SUFFIXES = (".bin", ".txt")
 MODEL_PLACES = (".", "sparse/0", "sparse", "0")
 CAMERAS_FILES = ("cameras.bin", "cameras.txt", "K.txt")
@@ -28,6 +30,15 @@ def find_model_folder(folder: Path) -> Path | None:
             if all((folder / place / f"{part}{suffix}").is_file() for part in MODEL_PARTS):
                 return folder / place
     return None
+
+
+def list_model_files(folder: Path) -> list[Path]:
+    """The files of the COLMAP model that :func:`find_model_folder` finds, sorted; none without a model."""
+    place = find_model_folder(folder)
+    if place is None:
+        return []
+    names = [f"{part}{suffix}" for part in (*MODEL_PARTS, *LATER_PARTS) for suffix in MODEL_SUFFIXES]
+    return sorted(file for name in names if (file := place / name).is_file())
 
 
 def find_cameras_file(path: Path) -> Path | None:

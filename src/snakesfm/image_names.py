@@ -18,7 +18,6 @@ def match_names(names: Sequence[str], reference_names: Sequence[str]) -> Array:
     rows = {name: row for row, name in enumerate(names)}
     matched = np.array([rows.get(name, -1) for name in reference_names], dtype=np.int64)
     for part in ("name", "stem"):
-        taken = set(matched.tolist())
         by_part: dict[str, list[int]] = {}
         for row, name in enumerate(names):
             by_part.setdefault(getattr(PurePosixPath(name), part), []).append(row)
@@ -26,6 +25,7 @@ def match_names(names: Sequence[str], reference_names: Sequence[str]) -> Array:
         counts = Counter(reference_parts)
         for row in np.flatnonzero(matched < 0).tolist():
             candidates = by_part.get(reference_parts[row], [])
-            if len(candidates) == 1 and counts[reference_parts[row]] == 1 and candidates[0] not in taken:
+            # no two references get the same row: all that could have its part
+            if len(candidates) == 1 and counts[reference_parts[row]] == 1:
                 matched[row] = candidates[0]
     return matched

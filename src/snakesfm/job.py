@@ -115,12 +115,11 @@ def _redirect_to_log(path: Path) -> Any:
 
 def _bind(call: Call, terminal: Any) -> Any:
     """The StageJob of a Snakemake job."""
-    from snakesfm.stages.job import JobOptions, Progress, StageJob
+    from snakesfm.stages.job import JobOptions, StageJob
 
     params = call.params
     outputs = tuple(Path(path) for path in call.files["outputs"])
     former = former_path(outputs[0])
-    Progress.terminal = terminal
     return StageJob(
         stage=call.stage,
         scene=call.files["scene"],
@@ -132,6 +131,7 @@ def _bind(call: Call, terminal: Any) -> Any:
         threads=call.threads,
         former=former if former.is_file() else None,
         batch_size=call.files["batch_size"],
+        terminal=terminal,
     )
 
 

@@ -1,5 +1,6 @@
 """The plan of a run for the Snakefile: its scenes, and the weights they need."""
 
+import contextlib
 import os
 from collections.abc import Mapping
 from pathlib import Path
@@ -13,8 +14,12 @@ from snakesfm.scene_plan import ScenePlan
 
 def _check_writable(folder: Path) -> None:
     """Refuse an output folder that cannot be made or written, before Snakemake stumbles over it."""
-    existing = next(path for path in (folder, *folder.absolute().parents) if path.exists())
-    if not existing.is_dir() or not os.access(existing, os.W_OK | os.X_OK):
+    writable = False
+    # raised where a folder above may not be entered
+    with contextlib.suppress(PermissionError):
+        existing = next(path for path in (folder, *folder.absolute().parents) if path.exists())
+        writable = existing.is_dir() and os.access(existing, os.W_OK | os.X_OK)
+    if not writable:
         raise ConfigError(
             f"The output folder '{folder}' cannot be written: choose another one with --config output=DIR."
         )

@@ -18,6 +18,11 @@ MAKES_NOTHING = re.compile(
 )
 # it does not make all of its targets, or keeps no records
 MAKES_PART = frozenset(("--until", "-U", "--omit-from", "-O", "--drop-metadata"))
+# an option that names rules, the first of them in the same word
+NAMES_RULES = re.compile(
+    r"(--until|--omit-from|--forcerun|--prioritize|--allowed-rules|--preemptible-rules)=(.*)|"
+    r"-[hkfFvpa]*([UORP])(.*)"
+)
 # the longest name of a file, less the mark of a part that goes on
 PART = 254
 # times pass through floating point
@@ -95,6 +100,20 @@ def check_folder(snakefile: str, records: Path = RECORDS) -> None:
             f"{place.resolve()} cannot be written: start it elsewhere with -s {snakefile}, "
             "or use --directory DIR."
         )
+
+
+def split_words(arguments: Iterable[str]) -> set[str]:
+    """The words of Snakemake's command line, with rules apart from the option that names them.
+
+    Parameters
+    ----------
+    arguments : of the command line; ``--until=RULE`` and ``-URULE`` are two words each.
+    """
+    words: set[str] = set()
+    for argument in arguments:
+        named = NAMES_RULES.fullmatch(argument)
+        words |= {argument} if named is None else {named[1] or f"-{named[3]}", named[2] or named[4]}
+    return words
 
 
 def makes_nothing(arguments: Iterable[str]) -> bool:

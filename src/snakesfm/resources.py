@@ -12,8 +12,8 @@ from dataclasses import dataclass
 AROUND_MB = 300
 # a busy file system and a slow start take minutes without any work
 START_MIN = 15
-# what needs were measured with, extract_features.max_shorter_side_px
-USUAL_SIDE_PX = 760
+# extract_features.max_shorter_side_px when needs were measured, which stays if its default changes
+MEASURED_SIDE_PX = 760
 # larger photographs are rare: who asks for more wants them as they are
 LARGEST_SIDE_PX = 6000
 
@@ -68,7 +68,8 @@ NEEDS = {
     "match_pairs": Need("tile", 400, 0.02, 0.03, pair_s=0.12),
     "merge_keypoints": Need("block", 600, 2.0, 0.1, image_s=1.0),
     "index_matches": Need("tile", 500, 2.0, 0.1, pair_s=0.1),
-    "calibrate_cameras": Need("scene", 500, 0.1, 0.0005, image_s=0.12),
+    # 40 kB for each of ten pairs per image, where every image has a camera of its own
+    "calibrate_cameras": Need("scene", 500, 0.6, 0.0005, image_s=0.12),
     "estimate_two_view": Need("tile", 500, 0.2, 0.03, pair_s=0.12),
     "build_view_graph": Need("scene", 300, 0.01, 0.002, image_s=0.06),
     "filter_view_graph": Need("scene", 800, 0.02, 0.002, image_s=0.12),
@@ -98,7 +99,7 @@ def job_load(
     pairs: int,
     networks: int = 0,
     batch: int = 1,
-    shorter_side_px: int = USUAL_SIDE_PX,
+    shorter_side_px: int = MEASURED_SIDE_PX,
 ) -> Load:
     """What one job of a stage works on, on average over the scene's blocks or tiles.
 
@@ -107,7 +108,7 @@ def job_load(
     grain = NEEDS[stage].grain
     if grain == "block":
         side = min(shorter_side_px, LARGEST_SIDE_PX)
-        area = (side / USUAL_SIDE_PX) ** 2 if NEEDS[stage].area_mb else 1.0
+        area = (side / MEASURED_SIDE_PX) ** 2 if NEEDS[stage].area_mb else 1.0
         return Load(images / blocks, 0, networks, batch, area)
     if grain == "tile":
         tiles = blocks * (blocks + 1) / 2

@@ -9,6 +9,11 @@ def keypoint_files(scene: ScenePlan) -> list[str]:
     return scene.files(scene.features_stage, "blocks")
 
 
+def exported_keypoints(scene: ScenePlan) -> list[str]:
+    """The keypoints of all blocks where the model is written with all of them, else nothing."""
+    return keypoint_files(scene) if scene.configuration.export_model.all_keypoints else []
+
+
 def match_files(scene: ScenePlan) -> list[str]:
     """The matches of all tiles that the stages after matching read."""
     return scene.files(scene.matches_stage, "tiles")

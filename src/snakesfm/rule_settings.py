@@ -1,6 +1,6 @@
 """What Snakemake's command line and profiles say of a rule, for rules that do the same in other scenes."""
 
-from collections.abc import Iterable, Set
+from collections.abc import Set
 from typing import Any
 
 from snakesfm.errors import ConfigError
@@ -22,12 +22,12 @@ def share_resources(settings: Any, rule: str, twins: Set[str]) -> None:
             said.update({twin: said[rule] for twin in twins if twin not in said})
 
 
-def check_named_together(words: Iterable[str], rule: str, twins: Set[str]) -> None:
+def check_named_together(words: Set[str], rule: str, twins: Set[str]) -> None:
     """Refuse a command line that names a rule and would so leave out the scenes of its twins.
 
     Parameters
     ----------
-    words : of Snakemake's command line, such as ``--until`` and the names of rules after it.
+    words : of Snakemake's command line, as :func:`snakesfm.records.split_words` gives them.
     rule : a rule's name.
     twins : names of rules.
 
@@ -35,8 +35,7 @@ def check_named_together(words: Iterable[str], rule: str, twins: Set[str]) -> No
     ------
     ConfigError : the rule is named, and not all of its twins are.
     """
-    named = {word.rpartition("=")[2] if word.startswith("--") else word for word in words}
-    if rule in named and not twins <= named:
+    if rule in words and not twins <= words:
         raise ConfigError(
             f"Scenes with other numbers of blocks have rule '{rule}' under other names: say "
             f"'{' '.join((rule, *sorted(twins)))}' in place of '{rule}'."

@@ -8,7 +8,7 @@ import re
 import subprocess
 import threading
 import time
-from collections.abc import Mapping, Set
+from collections.abc import Iterator, Mapping, Set
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +22,7 @@ from snakesfm.scene_plan import ScenePlan
 
 LOCK_NAME = ".snakesfm.lock"
 MOST_SENTENCES = 10
+RELATIVE_AUC = re.compile(r"relative_pose_auc_(.+)deg")
 
 
 class Run:
@@ -49,33 +50,26 @@ class Run:
         ------
         ConfigError : another run is writing to the folder.
         """
-        self._refuse_locked()
-        for scene in self.plan.scenes.values():
-            results = () if asked & MAKES_PART else scene.results(asked)
-            exporting = scene.options("export_model").model_dump(include={"link_images", "undistort"})
-            for path in [*unrecorded_files(results), *without_pictures(results, **exporting)]:
+        with self._beside_no_other():
+            for scene in self.plan.scenes.values():
+                results = () if asked & MAKES_PART else scene.results(asked)
+                exporting = scene.options("export_model").model_dump(include={"link_images", "undistort"})
+                for path in [*unrecorded_files(results), *without_pictures(results, **exporting)]:
+                    with contextlib.suppress(OSError):
+                        forget(path)
+                unknown = unrecorded_files(scene.artifacts())
+                if unknown:
+                    _set_aside(scene, unknown)
+
+    @contextlib.contextmanager
+    def _beside_no_other(self) -> Iterator[None]:
+        """Refuse to work beside another run, also without own jobs, and have none start meanwhile."""
+        with contextlib.ExitStack() as stack:
+            if self.plan.scenes:
                 with contextlib.suppress(OSError):
-                    forget(path)
-            unknown = unrecorded_files(scene.artifacts())
-            if not unknown:
-                continue
-            # loaded here, as most runs know their files and h5py takes a tenth of a second
-            from snakesfm.artifacts.checks import ASIDE, set_aside
-
-            found = set_aside(unknown, scene.name, scene.options_digests, scene.settings_text)
-            if found:
-                print(
-                    f"snakesfm: scene '{scene.name}': {len(found)} files without a record in this folder's "
-                    f".snakemake were renamed to *{ASIDE} and will be recreated: {found[0]}.",
-                    flush=True,
-                )
-
-    def _refuse_locked(self) -> None:
-        """Refuse to work beside another run; a run without jobs would not come to take the lock."""
-        if not self.plan.scenes:
-            return
-        with contextlib.suppress(OSError), (self.plan.output / LOCK_NAME).open(encoding="utf-8") as lock:
-            self._lock(lock, fcntl.LOCK_SH)
+                    lock = stack.enter_context((self.plan.output / LOCK_NAME).open(encoding="utf-8"))
+                    self._lock(lock, fcntl.LOCK_SH)
+            yield
 
     def _lock(self, lock: Any, how: int) -> None:
         """Lock the output folder, as far as the file system can, or refuse where another run holds it."""
@@ -284,9 +278,7 @@ class Run:
             return f"snakesfm: scene '{scene.name}': {', '.join(filter(None, (in_database, model)))}."
         others = summary.get("images_in_other_models", [])
         more = f" and {sum(others)} in {len(others)} other models" if others else ""
-        accuracy = ""
-        with contextlib.suppress(KeyError):
-            accuracy = _describe_accuracy(self._read_result(scene, "evaluate_model", "metrics.json"))
+        accuracy = _describe_accuracy(self._read_result(scene, "evaluate_model", "metrics.json"))
         return (
             f"snakesfm: scene '{scene.name}': {summary['registered_images']} of {summary['images']} images "
             f"registered{more}, {summary['points']} points, mean reprojection error "
@@ -296,14 +288,33 @@ class Run:
         )
 
 
+def _set_aside(scene: ScenePlan, unknown: list[Path]) -> None:
+    """Rename those of a scene's files that are not as this run would make them, and say so."""
+    # loaded here, as most runs know their files and h5py takes a tenth of a second
+    from snakesfm.artifacts.checks import ASIDE, set_aside
+
+    found = set_aside(unknown, scene.name, scene.options_digests, scene.settings_text)
+    if found:
+        print(
+            f"snakesfm: scene '{scene.name}': {len(found)} files without a record in this folder's "
+            f".snakemake were renamed to *{ASIDE} and will be recreated: {found[0]}.",
+            flush=True,
+        )
+
+
 def _describe_accuracy(metrics: dict[str, Any]) -> str:
-    """A clause on how near a model is to its reference."""
+    """A clause on how near a model is to its reference; empty where there is none."""
+    if "reference_images" not in metrics:
+        return ""
     images, present = metrics["reference_images"], metrics["reference_images_present"]
     if not present:
         return ", no image name occurs in the reference, so nothing is evaluated"
-    areas = [f"{metrics[f'relative_pose_auc_{degrees}deg']:.1f}" for degrees in (1, 3, 5)]
+    found = [column for column in map(RELATIVE_AUC.fullmatch, metrics) if column]
+    found.sort(key=lambda column: float(column[1]))
+    areas = "/".join(f"{metrics[column[0]]:.1f}" for column in found)
+    thresholds = "/".join(column[1] for column in found)
     share = f" over the reference's {images} images, {present} of them here" if present < images else ""
-    return f", relative-pose AUC {'/'.join(areas)} at 1/3/5 deg{share}"
+    return f", relative-pose AUC {areas} at {thresholds} deg{share}"
 
 
 def _cancel_timers() -> None:

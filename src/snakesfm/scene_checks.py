@@ -25,12 +25,18 @@ def check_scene(scene: ScenePlan) -> None:
     ------
     ConfigError : names the path and the remedy.
     """
-    _check_images(scene)
-    _check_keys_together(scene)
-    _check_given_files(scene)
-    _check_cameras(scene)
-    if scene.inputs.masks:
-        _check_masks(scene)
+    try:
+        _check_images(scene)
+        _check_keys_together(scene)
+        _check_given_files(scene)
+        _check_cameras(scene)
+        if scene.inputs.masks:
+            _check_masks(scene)
+    except PermissionError as error:
+        raise ConfigError(
+            f"'{error.filename}' of scene '{scene.name}' cannot be read: change its permissions or those "
+            "of the folders that it is in."
+        ) from None
     models = [model for stage in STAGES for model in scene.models(stage)]
     if len(models) > 1 and scene.weights.is_file():
         raise ConfigError(

@@ -14,7 +14,7 @@ from snakesfm.blocks import choose_blocks, tile_names
 from snakesfm.config.base import StageOptions
 from snakesfm.config.configuration import STAGES, SceneInputs
 from snakesfm.config.select_pairs import SelectPairsOptions
-from snakesfm.digests import file_digest, file_state, options_digest, settings_text
+from snakesfm.digests import file_digest, file_state, model_digest, options_digest, settings_text
 from snakesfm.front_ends import (
     DETECTOR_FREE,
     FRONT_ENDS,
@@ -152,7 +152,7 @@ class ScenePlan:
         method = self.method(stage)
         if method == "virtual_places" or (method == "virtual" and stage == "extract_features"):
             reference = str(Path(self.inputs.reference).expanduser())
-            return {"reference": reference, "source_content": file_digest(reference)}
+            return {"reference": reference, "source_content": model_digest(reference)}
         if method == "imported":
             folder = Path(self.inputs.imported).expanduser()
             name = FEATURES if stage == "extract_features" else MATCHES
@@ -280,7 +280,10 @@ class ScenePlan:
     def artifacts(self) -> list[str]:
         """The artifacts of all stages."""
         files = [str(self.folder / name) for name in SCENE_ARTIFACTS]
-        files += self.files(self.features_stage, "blocks")
+        if self.detects_keypoints:
+            files += self.files("extract_features", "blocks")
+        if self.detector_free:
+            files += self.files("merge_keypoints", "blocks")
         for stage in dict.fromkeys(
             ("select_pairs", "match_pairs", self.matches_stage, "estimate_two_view")
         ):
@@ -351,7 +354,7 @@ class ScenePlan:
             # the model's folder links to what the image folder is, which may be a link that is turned
             return {"images": str(self.images), "images_target": str(self.images.resolve())} | masks
         if stage == "evaluate_model":
-            return {"reference": inputs.reference, "reference_content": file_digest(inputs.reference)}
+            return {"reference": inputs.reference, "reference_content": model_digest(inputs.reference)}
         return {}
 
     def params(self, stage: str, wildcards: Mapping[str, str], main_process: bool) -> str:

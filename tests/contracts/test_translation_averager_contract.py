@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
+from snakesfm.config.average_translations import AverageTranslationsOptions
+from snakesfm.stages.average_translations import translation_averager
 from snakesfm.synthetic.problems import make_problem, perturb_rotations
-from snakesfm.translation_averaging.averagers import GlobalPositioning, ScaleChain, TranslationRecovery
 from snakesfm.translation_averaging.problem import PositioningProblem, edge_directions, world_rays
 
 
@@ -34,6 +35,11 @@ def center_errors(estimated, truth):
     assert scale > 0
     shift = np.median(b - scale * a, axis=0)
     return np.linalg.norm(scale * a + shift - b, axis=1)
+
+
+def with_options(method, **options):
+    """An averager with the options' defaults and changes."""
+    return translation_averager(AverageTranslationsOptions(method=method, **options))
 
 
 class TranslationAveragerContract:
@@ -74,28 +80,28 @@ class TranslationAveragerContract:
 
 
 class TestScaleChain(TranslationAveragerContract):
-    averager = ScaleChain()
+    averager = with_options("scale_chain")
 
 
 class TestTranslationRecovery(TranslationAveragerContract):
-    averager = TranslationRecovery()
+    averager = with_options("translation_recovery")
 
 
 class TestTranslationRecoveryMfas(TranslationAveragerContract):
-    averager = TranslationRecovery(reject_outliers="mfas")
+    averager = with_options("translation_recovery", reject_outliers="mfas")
 
 
 class TestTranslationRecoveryNone(TranslationAveragerContract):
-    averager = TranslationRecovery(reject_outliers="none")
+    averager = with_options("translation_recovery", reject_outliers="none")
 
 
 class TestGlobalPositioning(TranslationAveragerContract):
-    averager = GlobalPositioning()
+    averager = with_options("global_positioning")
     exact_tolerance = 2e-2
     same_tolerance = 1e-6
 
 
 class TestGlobalPositioningFromChain(TranslationAveragerContract):
-    averager = GlobalPositioning(start="chain")
+    averager = with_options("global_positioning", positioning_start="chain")
     exact_tolerance = 2e-2
     same_tolerance = 1e-6

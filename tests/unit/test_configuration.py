@@ -1,5 +1,6 @@
 """The configuration: unknown keys, wrong values, scenes."""
 
+import datetime
 import json
 
 import pytest
@@ -8,6 +9,8 @@ from hypothesis import strategies as st
 
 from snakesfm.config.configuration import (
     STAGES,
+    RunOptions,
+    check_spelling,
     list_scenes,
     load_configuration,
     options_class,
@@ -109,8 +112,27 @@ def test_scene_takes_the_name_of_its_folder_or_of_its_parent() -> None:
     assert scene_name("/data/castle/Images/") == "castle"
 
 
-def test_numbers_from_the_command_line_are_names() -> None:
-    assert list(list_scenes(load_configuration({"images": "x", "scene": 2024}))) == ["2024"]
+@pytest.mark.parametrize("value", [2024, datetime.date(2024, 5, 1)])
+def test_what_looks_like_a_number_or_a_date_is_a_name(value: object) -> None:
+    assert list(list_scenes(load_configuration({"images": "x", "scene": value}))) == [str(value)]
+    free = [key for key, field in RunOptions.model_fields.items() if field.annotation is str]
+    assert {"images", "cameras", "weights"} < set(free)
+    for key in free:
+        assert getattr(load_configuration({key: value}), key) == str(value)
+    assert list(load_configuration({"scenes": {value: {"images": "x"}}}).scenes) == [str(value)]
+
+
+def test_scenes_without_any_are_none() -> None:
+    assert list(list_scenes(load_configuration({"scenes": None, "images": "x"}))) == ["x"]
+
+
+def test_of_keys_that_are_typed_twice_the_last_counts() -> None:
+    check_spelling({"images": 5}, ["images=1_0", "images=5"])
+    check_spelling({"images": "1_0_"}, ["images=1_0_"])
+    with pytest.raises(ConfigError, match=r"images=1_0 as the number 10: write images=\./1_0"):
+        check_spelling({"images": 10}, ["images=5", "images=1_0"])
+    with pytest.raises(ConfigError, match=r"scene=007 as the number 7: choose another name"):
+        check_spelling({"scene": 7}, ["scene=007"])
 
 
 def test_scenes_replace_images_and_both_are_refused() -> None:

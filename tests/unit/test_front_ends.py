@@ -31,6 +31,7 @@ from snakesfm.rule_inputs import (
     coordinate_files,
     described_features,
     described_images,
+    exported_keypoints,
     keypoint_files,
     match_files,
     matched_features,
@@ -149,8 +150,9 @@ def test_exact_keypoints_are_not_refined_in_the_images(tmp_path: Path) -> None:
 
 
 def test_virtual_and_imported_ask_for_what_they_read(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="reference=PATH"):
-        plan_of(tmp_path, front_end="virtual")
+    for front_end in ("virtual", "virtual_places"):
+        with pytest.raises(ConfigError, match="reference=PATH"):
+            plan_of(tmp_path, front_end=front_end)
     with pytest.raises(ConfigError, match="imported=DIR"):
         plan_of(tmp_path, front_end="imported")
     (tmp_path / "features.h5").write_bytes(b"features")
@@ -221,7 +223,9 @@ def test_without_keypoints_the_stages_after_matching_read_merged_ones(tmp_path: 
     assert sift.features_stage == "extract_features" and sift.matches_stage == "match_pairs"
     assert not any("merge_keypoints" in file for file in sift.all_files())
     assert matched_features(sift, "0-1") == tile_features(sift, "0-1") == keypoint_files(sift)
-    assert matched_images(sift) == coordinate_files(sift) == []
+    assert matched_images(sift) == coordinate_files(sift) == exported_keypoints(sift) == []
+    (complete,) = plan_of(tmp_path, export_model={"all_keypoints": True}).scenes.values()
+    assert exported_keypoints(complete) == keypoint_files(sift)
     assert tile_matches(sift, "0-1") in match_files(sift) == sift.files("match_pairs", "tiles")
 
 
@@ -304,8 +308,27 @@ def test_networks_that_describe_images_need_no_keypoints_and_no_vocabulary(tmp_p
         )
         assert scene.gpus("describe_images") == (method == "megaloc")
         assert scene.detects_keypoints == (method == "vlad")
+        # what a run makes again where it was lost
+        made = {Path(file).parent.name for file in scene.all_files()}
+        assert {"describe_images", "match_pairs", "index_matches"} <= made
+        assert ("learn_vocabulary" in made) == (method == "vlad")
     command = json.loads(scene.params("describe_images", {"block": "0"}, True))["settings"]["fetch"]
     assert "front_end=loftr" in command and "'describe_images={method: megaloc}'" in command
+
+
+@pytest.mark.parametrize(("pairs", "models"), [("retrieval", ["aliked"]), ("exhaustive", [])])
+def test_keypoints_that_only_choose_pairs_have_their_network_too(
+    tmp_path: Path, pairs: str, models: list[str]
+) -> None:
+    methods = {"extract_features": {"method": "aliked"}, "match_pairs": {"method": "loftr"}}
+    (scene,) = plan_of(tmp_path, **methods, select_pairs={"method": pairs}).scenes.values()
+    assert scene.models("extract_features") == models
+    assert scene.gpus("extract_features") == len(models)
+
+
+def test_large_images_ask_for_what_they_take(tmp_path: Path) -> None:
+    (scene,) = plan_of(tmp_path, extract_features={"max_shorter_side_px": 1520}).scenes.values()
+    assert scene.load("extract_features").area == 4.0
 
 
 def test_one_file_of_weights_serves_one_network(tmp_path: Path) -> None:

@@ -38,6 +38,17 @@ def truncate(path: Path) -> None:
     path.write_bytes(path.read_bytes()[:-300])
 
 
+def flip_byte(before: bytes, count: int) -> Callable[[Path], None]:
+    """Damage a file in one byte, so far after the first place of others."""
+
+    def damage(path: Path) -> None:
+        content = bytearray(path.read_bytes())
+        content[content.index(before) + count] ^= 0xFF
+        path.write_bytes(content)
+
+    return damage
+
+
 def test_a_file_of_this_scene_and_configuration_is_left_alone(tmp_path: Path) -> None:
     path = write_pairs(tmp_path / "0-0.h5")
     before = path.read_bytes()
@@ -51,6 +62,9 @@ def test_a_file_of_this_scene_and_configuration_is_left_alone(tmp_path: Path) ->
         (truncate, "is damaged"),
         (lambda path: path.write_bytes(b""), "is damaged"),
         (lambda path: path.write_bytes(b"\0" * 5000), "is damaged"),
+        # an attribute's type, and a text that is no UTF-8 then
+        (flip_byte(b"stage\0", -4), "is damaged"),
+        (flip_byte(b'{"a": 1}', 0), "is damaged"),
         (lambda path: write_pairs(path, version=2), "another version"),
         (lambda path: write_pairs(path, options='{"a": 2}'), "other options"),
         (lambda path: write_pairs(path, scene="t"), "is of scene 't'"),
@@ -78,6 +92,15 @@ def test_one_sentence_for_several_files(tmp_path: Path) -> None:
         check_inputs([first, second], "s", DIGESTS)
     assert not first.exists()
     assert not second.exists()
+
+
+def test_a_file_with_damaged_attributes_is_not_read(tmp_path: Path) -> None:
+    path = write_pairs(tmp_path / "0-0.h5")
+    # the heap that holds all texts
+    flip_byte(b"GCOL", 0)(path)
+    assert ImagePairs.read_former(path) is None
+    with pytest.raises(ArtifactError, match="is damaged or not an HDF5 file: delete it"):
+        ImagePairs.read(path)
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,6 @@
 """What a job's log says of its cost."""
 
-from snakesfm.job_logs import describe_cost, stage_costs
+from snakesfm.job_logs import clock, describe_cost, stage_costs
 
 
 def test_costs_of_a_stages_jobs_are_joined() -> None:
@@ -10,6 +10,10 @@ def test_costs_of_a_stages_jobs_are_joined() -> None:
         f"scene: 3 of 9 images\n{describe_cost('index_images', 1.0, 0.5, 0.4, 80.0)}\n",
     ]
     assert stage_costs(logs) == {"match_pairs": (4.0, 300.0), "index_images": (0.5, 80.0)}
+
+
+def test_the_clock_has_three_digits_behind_the_seconds() -> None:
+    assert [clock(seconds)[-6:] for seconds in (7.0, 7.0625, 7.5)] == ["07.000", "07.062", "07.500"]
 
 
 def test_a_job_that_was_run_again_counts_with_its_last_run() -> None:

@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 from snakesfm import run_pipe
+from snakesfm.job import THREAD_VARIABLES
 from snakesfm.job_server import JobServer
 from snakesfm.start import NO_SERVER, VARIABLE
 
@@ -38,7 +39,8 @@ def wait_until(condition: Callable[[], object], seconds: float = 20) -> None:
 def parent(tmp_path: Path) -> Iterator[Command]:
     """A process that has started a server; its ``address`` is ready."""
     environment = {**os.environ, "TMPDIR": str(tmp_path)}
-    environment.pop(VARIABLE, None)
+    for variable in (VARIABLE, *THREAD_VARIABLES):
+        environment.pop(variable, None)
     process = subprocess.Popen(
         [sys.executable, "-c", PARENT],
         stdin=subprocess.PIPE,
@@ -234,6 +236,8 @@ def test_the_server_ends_with_who_started_it(
     parent: Command, address: str, number: int, tmp_path: Path
 ) -> None:
     server = server_of(parent)
+    # of which a fork would have none, whereas libraries take them for there
+    assert "Threads:\t1\n" in Path(f"/proc/{server}/status").read_text()
     parent.send_signal(number)
     parent.wait(timeout=10)
     wait_until(lambda: not Path(address).parent.exists())
@@ -257,7 +261,8 @@ def test_jobs_go_on_when_the_server_is_killed(
             input=call_text(tmp_path / "out", tmp_path / "missing"),
             capture_output=True,
             text=True,
-            env={**os.environ, VARIABLE: value},
+            # nor is a pipe missed that is gone
+            env={**os.environ, VARIABLE: value, run_pipe.VARIABLE: str(tmp_path / "nothing")},
             timeout=60,
             check=False,
         )

@@ -1,31 +1,14 @@
 """Which outputs Snakemake has a record of."""
 
 import json
-import os
 from base64 import urlsafe_b64encode
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
+from users import without_root
 
 from snakesfm.errors import ConfigError
 from snakesfm.records import check_folder, forget, makes_nothing, unrecorded_files, was_made_with
-
-NOBODY = 65534
-
-
-@contextmanager
-def without_root() -> Iterator[None]:
-    """As a user whom permissions of files concern."""
-    user = os.geteuid()
-    if user == 0:
-        os.seteuid(NOBODY)
-    try:
-        yield
-    finally:
-        if user == 0:
-            os.seteuid(0)
 
 
 def test_a_folder_without_room_for_records_is_named(
@@ -86,6 +69,7 @@ def test_a_forgotten_file_stays_and_is_older_than_all_and_unrecorded(tmp_path: P
     assert unrecorded_files([str(path)], records) == []
     forget(path, records)
     assert path.stat().st_mtime == 1
+    assert list(records.iterdir()) == []
     assert unrecorded_files([str(path)], records) == [path]
 
 
@@ -107,6 +91,10 @@ def test_a_forgotten_file_stays_and_is_older_than_all_and_unrecorded(tmp_path: P
         (["--lint"], True),
         (["--rulegraph", "mermaid-js"], True),
         (["--unlock"], True),
+        (["--touch"], True),
+        (["-t"], True),
+        (["--cleanup-metadata", "out/a.h5"], True),
+        (["--delete-all-output"], True),
     ],
 )
 def test_what_makes_nothing_is_told_by_its_arguments(arguments: list[str], nothing: bool) -> None:

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from snakesfm.config.configuration import STAGES
-from snakesfm.resources import NEEDS, Load, job_load, memory_mb, runtime_min
+from snakesfm.resources import NEEDS, START_MIN, Load, job_load, memory_mb, runtime_min
 
 
 def test_every_stage_has_a_need() -> None:
@@ -30,6 +30,7 @@ def test_needs_grow_with_the_scene(stage: str) -> None:
 
 def test_pairs_are_dealt_to_the_tiles() -> None:
     assert job_load("match_pairs", 1000, 8, 3600) == Load(250, 100)
+    assert job_load("match_pairs", 1000, 1, 3600) == Load(1000, 3600)
 
 
 @pytest.mark.parametrize("stage", STAGES)
@@ -49,11 +50,15 @@ def test_the_page_on_clusters_names_the_needs(root: Path, stage: str) -> None:
 
 @pytest.mark.parametrize(("side", "measured_mb"), [(760, 265), (1520, 864), (2200, 1739), (3000, 3180)])
 def test_larger_images_ask_for_what_they_take(side: int, measured_mb: int) -> None:
-    usual, load = (
-        job_load("extract_features", 100, 4, 3000, shorter_side_px=pixels) for pixels in (760, side)
-    )
+    for networks in (0, 1):
+        usual, load = (
+            job_load("extract_features", 400, 4, 3000, networks, shorter_side_px=pixels)
+            for pixels in (760, side)
+        )
+        before, after = (runtime_min("extract_features", job) - START_MIN for job in (usual, load))
+        assert (before - 1) * load.area < after <= before * load.area + 1
+    load = job_load("extract_features", 100, 4, 3000, shorter_side_px=side)
     assert 1.5 * measured_mb < memory_mb("extract_features", load) < 8 * measured_mb
-    assert runtime_min("extract_features", load) >= runtime_min("extract_features", usual)
     huge = job_load("extract_features", 100, 4, 3000, shorter_side_px=20_000)
     assert memory_mb("extract_features", huge) < 30_000
     assert job_load("match_pairs", 100, 4, 3000, shorter_side_px=side).area == 1.0

@@ -1,9 +1,11 @@
 """What is refused before a scene's first job: keys without effect, and paths of the wrong kind."""
 
 import struct
+import tempfile
 from pathlib import Path
 
 import pytest
+from users import without_root
 
 from snakesfm.errors import ConfigError
 from snakesfm.plan import Plan
@@ -117,6 +119,36 @@ def test_a_path_of_another_kind_is_refused(key: str, path: str, message: str, tm
     assert "\n" not in str(refused.value)
 
 
+@pytest.mark.parametrize(("images", "hint"), [("demo/images", True), ("photos/images", False)])
+def test_how_to_make_the_demo_is_said_where_it_is_missing(
+    images: str, hint: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ConfigError, match=f"'{images}' does not exist") as refused:
+        Plan({"images": images})
+    assert ("make demo" in str(refused.value)) == hint
+
+
+def test_what_may_not_be_read_is_named() -> None:
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        folder.chmod(0o755)
+        assert len(plan_of(folder, cameras="K.txt").scenes) == 1
+        (folder / "out").mkdir()
+        (folder / "out").chmod(0o777)
+        config = {key: str(folder / name) for key, name in (("images", "photos"), ("output", "out"))}
+        config["cameras"] = str(folder / "K.txt")
+        (folder / "K.txt").chmod(0)
+        with without_root(), pytest.raises(ConfigError, match=r"K\.txt', .* cannot be read \(Permission"):
+            Plan(config)
+        folder.chmod(0)
+        with without_root(), pytest.raises(ConfigError, match=r"output folder '.*out' cannot be written"):
+            Plan(config)
+        config["output"] = tempfile.gettempdir()
+        with without_root(), pytest.raises(ConfigError, match=r"photos'.* cannot be read: change its perm"):
+            Plan(config)
+
+
 @pytest.mark.parametrize("place", ["", "0", "sparse", "sparse/0"])
 @pytest.mark.parametrize("suffix", [".bin", ".txt"])
 def test_a_reference_may_lie_in_any_place(place: str, suffix: str, tmp_path: Path) -> None:
@@ -130,14 +162,23 @@ def test_a_reference_may_lie_in_any_place(place: str, suffix: str, tmp_path: Pat
         plan_of(tmp_path, reference="there")
 
 
-@pytest.mark.parametrize(("model", "count"), [(0, 3), (1, 4), (4, 8), (6, 12)])
+@pytest.mark.parametrize(("model", "count"), [(0, 3), (1, 4), (4, 8), (6, 12), (11, 16)])
 def test_binary_cameras_of_any_model_are_taken(model: int, count: int, tmp_path: Path) -> None:
     camera = struct.pack(f"<IiQQ{count}d", 1, model, 640, 480, *[1.0] * count)
     (tmp_path / "cameras.bin").write_bytes(struct.pack("<Q", 2) + camera + camera)
     assert len(plan_of(tmp_path, cameras="cameras.bin").scenes) == 1
 
 
-@pytest.mark.parametrize("text", [f"\ufeff{MATRIX}", f"# f in pixels\n\n {MATRIX}", f"\ufeff{CAMERAS}"])
+@pytest.mark.parametrize(
+    "text",
+    [
+        f"\ufeff{MATRIX}",
+        f"# f in pixels\n\n {MATRIX}",
+        f"\ufeff{CAMERAS}",
+        # the job that reads it says that it has no cameras
+        "# Camera list\n",
+    ],
+)
 def test_text_of_cameras_may_begin_with_comments_and_a_mark(text: str, tmp_path: Path) -> None:
     (tmp_path / "mine.dat").write_text(text, "utf-8")
     assert len(plan_of(tmp_path, cameras="mine.dat").scenes) == 1

@@ -100,6 +100,23 @@ def test_a_job_that_slurm_forgot_is_looked_for_after_a_while(slurm_answers, monk
     assert answers == [(["7", "8"], [])] * 2 + [(["8"], ["7"])]
 
 
+def test_a_job_is_kept_while_nobody_can_say_whether_it_is_there(slurm_answers, monkeypatch):
+    def fail(run):
+        raise slurm.subprocess.TimeoutExpired("squeue", 60)
+
+    monkeypatch.setattr(slurm, "list_jobs", fail)
+    assert [slurm_answers({"8": "RUNNING"}) for _ in range(4)] == [(["7", "8"], [])] * 4
+
+
+@pytest.mark.parametrize(("known", "later"), [(300, 300), (None, 120)])
+def test_how_long_slurm_remembers_jobs_is_asked_until_it_is_known(monkeypatch, known, later):
+    module, ages = sys.modules[__name__], [known, 120]
+    monkeypatch.setattr(module, "get_min_job_age", lambda: ages.pop(0))
+    monkeypatch.setattr(module, "query_job_status", query_job_status)
+    slurm.steady(Plugin())
+    assert module.get_min_job_age() == later
+
+
 def test_jobs_are_asked_for_at_a_steady_pace(slurm_answers):
     executor = slurm_answers.executor
     assert executor.next_seconds_between_status_checks == 5

@@ -196,6 +196,8 @@ def test_runs_share_features_and_matches_by_their_digests(small_scene: Path, wor
         *until, *config_of(small_scene, "second"), "scene=other", "average_rotations={passes: 3}"
     )
     assert second.status == 0, second.text
+    with h5py.File(damaged) as repaired:
+        assert repaired.attrs["stage"] == "match_pairs"
     counts = taken_over(workflow.folder / "second" / "other")
     assert len(counts) == 5
     assert sum(taken == 0 for _, taken in counts.values()) == 1

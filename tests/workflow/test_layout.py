@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from snakesfm.config.configuration import STAGES, configuration_class, options_class
+from snakesfm.scene_plan import STAGES_IN_DETECTOR_PIXELS, STAGES_WITH_NETWORKS
 
 DOMAIN_MAY_IMPORT_NOT = (
     "snakesfm.stages",
@@ -20,6 +21,8 @@ DOMAIN_MAY_IMPORT_NOT = (
 )
 NO_DOMAIN = {"stages", "artifacts", "config"}
 NO_STAGES = {"fetch_weights", "hloc"}
+# those that do more than write files with a second thread
+TWO_THREADS = {"index_images", "select_pairs", "calibrate_cameras", "adjust_bundle"}
 
 
 def rule_texts(root: Path) -> dict[str, str]:
@@ -52,8 +55,20 @@ def test_rule_writes_to_the_folder_of_its_name_and_runs_its_script(root: Path, s
     output = re.search(r"output:\n(.*?)log:", text, re.S)[1]
     assert set(re.findall(r'artifact\(\s*"(\w+)"', output)) == {stage}
     assert text.count("files=job_files(),") == 1
-    for directive in ("log_file", "job_params", "job_command"):
+    for directive in ("log_file", "job_params", "job_command", "memory_mb", "runtime_min"):
         assert re.findall(rf'{directive}\("(\w+)"', text) == [stage]
+    assert re.findall(r'gpu=gpus\("(\w+)"', text) == [stage] * (stage in STAGES_WITH_NETWORKS)
+    assert re.findall(r"threads: (\d+)", text) == ["2"] * (stage in TWO_THREADS)
+
+
+@pytest.mark.parametrize("stage", STAGES)
+def test_stage_is_told_the_detectors_pixels_if_it_converts_keypoints_to_them(
+    root: Path, stage: str
+) -> None:
+    converts = "snakesfm.geometry.detector_pixels" in (
+        root / "src/snakesfm/stages" / f"{stage}.py"
+    ).read_text("utf-8")
+    assert converts == (stage in STAGES_IN_DETECTOR_PIXELS)
 
 
 @pytest.mark.parametrize("stage", STAGES)

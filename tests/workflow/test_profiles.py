@@ -7,6 +7,7 @@ import pytest
 import yaml
 from workflow_runner import Workflow
 
+from snakesfm.config.configuration import STAGES
 from snakesfm.scene_plan import STAGES_WITH_NETWORKS
 
 pytestmark = pytest.mark.workflow
@@ -41,6 +42,14 @@ def test_a_cluster_runs_jobs_by_the_same_rules_as_a_laptop(root: Path, name: str
         "show-failed-logs",
     ):
         assert cluster[key] == local[key]
+
+
+@pytest.mark.parametrize("name", CLUSTERS)
+def test_jobs_that_follow_one_another_alone_are_grouped(root: Path, name: str) -> None:
+    first, last = STAGES.index("build_view_graph"), STAGES.index("adjust_bundle")
+    groups = {stage: "mapping" for stage in STAGES[first : last + 1]}
+    groups |= {stage: "finish" for stage in ("export_model", "evaluate_model", "render_report")}
+    assert read_profile(root, name)["groups"] == groups
 
 
 @pytest.mark.parametrize("name", ["local", *CLUSTERS])

@@ -7,6 +7,7 @@ import os
 import re
 import shutil
 import signal
+import subprocess
 import time
 from pathlib import Path
 
@@ -364,6 +365,19 @@ def test_a_model_of_former_images_is_not_called_this_run_s(finished, small_scene
     assert "COLMAP database in out/square/export_database/database.db" in line
     assert "the model is older than its images" in line
     assert "registered" not in line
+
+
+def test_the_workflow_may_lie_in_a_folder_of_any_name(root: Path, small_scene: Path, workflow) -> None:
+    project = workflow.folder / "snake's {sfm} 2"
+    for folder in ("workflow", "scripts"):
+        shutil.copytree(root / folder, project / folder)
+    for file in ("Snakefile", "config.yaml"):
+        shutil.copy(root / file, project)
+    command = workflow.command("--until", "index_images", *config_of(small_scene))
+    command[command.index("--snakefile") + 1] = str(project / "Snakefile")
+    done = subprocess.run(command, cwd=workflow.folder, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert (workflow.folder / "out" / "square" / "index_images" / "index.h5").is_file()
 
 
 def test_the_output_may_be_the_folder_one_is_in(small_scene: Path, workflow) -> None:

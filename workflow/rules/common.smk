@@ -15,7 +15,7 @@ from snakesfm.config.configuration import SCENE_PATTERN, check_spelling
 from snakesfm.job_server import JobServer
 from snakesfm.model_files import MODEL_FILES
 from snakesfm.plan import Plan
-from snakesfm.records import check_folder, makes_nothing
+from snakesfm.records import check_folder, makes_nothing, split_words
 from snakesfm.rule_settings import check_named_together, share_resources
 from snakesfm.run import Run
 from snakesfm.scene_plan import ScenePlan
@@ -31,13 +31,14 @@ def refusal(error):
 
 try:
     # Snakemake knows its targets only later, and this one needs no images
-    asked = {argument.split(":")[0] for argument in sys.argv[1:]}
+    words = split_words(sys.argv[1:])
+    asked = {word.split(":")[0] for word in words}
     if workflow.is_main_process:
         check_folder(workflow.main_snakefile)
     check_spelling(config, sys.argv[1:])
     PLAN = Plan(config, weights_only="fetch_weights" in asked)
     if workflow.is_main_process:
-        check_named_together(sys.argv[1:], "select_pairs", PLAN.select_pairs_twins())
+        check_named_together(words, "select_pairs", PLAN.select_pairs_twins())
     RUN = Run(PLAN)
     if workflow.is_main_process and not makes_nothing(sys.argv[1:]):
         RUN.refuse_unrecorded(asked)

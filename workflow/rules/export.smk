@@ -57,6 +57,7 @@ rule export_model:
     input:
         index=artifact("index_images", "index.h5"),
         cameras=artifact("calibrate_cameras", "cameras.h5"),
+        features=of_scene(rule_inputs.exported_keypoints),
         reconstruction=artifact("adjust_bundle", "reconstruction.h5"),
     output:
         [artifact("export_model", name) for name in MODEL_FILES],

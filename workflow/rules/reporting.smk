@@ -4,6 +4,7 @@
 rule render_report:
     input:
         index=artifact("index_images", "index.h5"),
+        cameras=artifact("calibrate_cameras", "cameras.h5"),
         geometries=files_of("estimate_two_view", "tiles"),
         graph=artifact("filter_view_graph", "graph.h5"),
         rotations=artifact("average_rotations", "rotations.h5"),

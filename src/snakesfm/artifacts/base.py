@@ -160,15 +160,19 @@ class Artifact:
         ------
         ArtifactError : the file is missing, damaged, of another kind or of another version.
         """
+        file = None
         try:
             file = h5py.File(path, "r", locking=False)
+            kind, version = file.attrs.get("artifact"), file.attrs.get("format_version")
         except FileNotFoundError:
             raise ArtifactError(f"{path} is missing: run snakemake again to make it.") from None
-        except OSError:
+        # what h5py raises on damage has no common kind
+        except Exception:
+            if file is not None:
+                file.close()
             raise ArtifactError(
                 f"{path} is damaged or not an HDF5 file: delete it and run snakemake again."
             ) from None
-        kind, version = file.attrs.get("artifact"), file.attrs.get("format_version")
         if kind != cls.kind or version != cls.format_version:
             file.close()
             raise ArtifactError(
@@ -198,9 +202,12 @@ def read_header(path: Path | str) -> Mapping[str, Any]:
     """The root attributes of an artifact's file; empty where it cannot be read."""
     try:
         with h5py.File(path, "r", locking=False) as file:
-            return dict(file.attrs)
-    except OSError:
+            header = dict(file.attrs)
+        # text with bytes that are no UTF-8 can be neither digested nor printed
+        "".join(map(str, header.values())).encode()
+    except Exception:
         return {}
+    return header
 
 
 class atomic_path:  # noqa: N801 - used as a function, like contextlib's

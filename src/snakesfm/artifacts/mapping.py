@@ -52,12 +52,13 @@ class CameraCenters(Artifact):
     """Averaged camera centres."""
 
     kind: ClassVar[str] = "camera_centers"
+    format_version: ClassVar[int] = 2
 
     centers: Array = column("(N,3)", "float64", "camera centre in the world; NaN where there is none")
-    edge_residuals_deg: Array = column("(E)", "float64", "angle of the edge's direction to the centres")
-    edge_used: Array = column("(E)", "bool", "the edge's direction took part")
-    ray_track_ids: Array = column("(Q)", "int64", "part of a track of each camera-landmark ray")
-    ray_residuals_deg: Array = column("(Q)", "float64", "angle of the ray to its landmark")
+    edge_residuals_deg: Array = column(
+        "(E)", "float64", "angle of the edge's direction to the centres, NaN for edges that took no part"
+    )
+    ray_residuals_deg: Array = column("(Q)", "float64", "angle of each ray that took part to its landmark")
 
 
 @dataclass(frozen=True)

@@ -26,6 +26,9 @@ AFFINE_DAMPING = 1e-3
 """Holds the affine part, relative to the weight of the shift, where a patch has little texture."""
 PATCHES_AT_ONCE = 256
 """Arrays over so many patches stay in a core's cache."""
+IMAGES_AT_ONCE = 16
+"""So many images are worked on in turn: even of large ones more are held."""
+NOTHING = np.zeros(0, np.int64)
 
 
 @dataclass(frozen=True)
@@ -52,6 +55,38 @@ class AlignmentSettings:
     min_correlation: float = 0.8
     iterations: int = 6
     threads: int = 1
+
+
+@dataclass(frozen=True)
+class _Templates:
+    """The observations that others are aligned to.
+
+    Parameters
+    ----------
+    rows : (K,) of the observations, ascending.
+    present : (K,) bool, whether their images have pixels.
+    patches : (K,S,S) float32 gray values around them.
+    inverses : (K,6,6) float64, see :func:`_inverse_normals`.
+    to_plane : (K,2,2), coordinates on the point's plane from pixels of the gray image.
+    """
+
+    rows: Array
+    present: Array
+    patches: Array
+    inverses: Array
+    to_plane: Array
+
+    @classmethod
+    def at(cls, rows: Array, radius: int) -> "_Templates":
+        """None of them is present yet."""
+        count, side = len(rows), 2 * radius + 3
+        return cls(
+            rows,
+            np.zeros(count, dtype=bool),
+            np.zeros((count, side, side), dtype=np.float32),
+            np.zeros((count, 6, 6)),
+            np.zeros((count, 2, 2)),
+        )
 
 
 def choose_templates(directions: Array, sizes: Array, inside: Array, offsets: Array) -> Array:
@@ -105,58 +140,65 @@ def align_observations(
     Pixels (L,2), and which observations (L,) bool were aligned or are templates; the others did not move.
     """
     moved, aligned = pixels.copy(), np.zeros(len(images), dtype=bool)
-    others = templates != np.arange(len(images))
-    usable = others & inside & inside[templates]
-    sources = np.unique(templates[usable])
-    side = 2 * settings.radius_px + 3
-    patches = np.zeros((len(sources), side, side), dtype=np.float32)
-    scales = np.ones((int(images.max(initial=-1)) + 1, 2))
-    x, y = _grid(settings.radius_px + 1)
+    usable = np.flatnonzero((templates != np.arange(len(images))) & inside & inside[templates])
+    cut = _Templates.at(np.unique(templates[usable]), settings.radius_px)
+    # an image is aligned as soon as all its templates are cut, when a sequence's images are still held
+    last = np.arange(int(images.max(initial=-1)) + 1)
+    np.maximum.at(last, images[usable], images[templates[usable]])
+    to_cut = dict(rows_of_each(images[cut.rows] // IMAGES_AT_ONCE))
+    to_align = dict(rows_of_each(last[images[usable]] // IMAGES_AT_ONCE))
+
+    def align(part: tuple[int, Array]) -> tuple[Array, Array]:
+        image, mine = part
+        chosen = np.searchsorted(cut.rows, templates[mine])
+        return _align_in_image(read_gray(image), pixels[mine], tangents[mine], cut, chosen, settings)
+
+    # OpenCV and numpy run without Python's lock
+    with ThreadPoolExecutor(settings.threads) as pool:
+        for batch in sorted(to_cut.keys() | to_align.keys()):
+            own = to_cut.get(batch, NOTHING)
+            _cut_templates(pool, read_gray, images, pixels, tangents, cut, own)
+            aligned[cut.rows[own]] = cut.present[own]
+            rows = usable[to_align.get(batch, NOTHING)]
+            rows = rows[aligned[templates[rows]]]
+            parts = [(image, rows[mine]) for image, mine in rows_of_each(images[rows])]
+            for (_, mine), found in zip(parts, pool.map(align, parts), strict=True):
+                moved[mine], aligned[mine] = found
+    return moved, aligned
+
+
+def _cut_templates(
+    pool: ThreadPoolExecutor,
+    read_gray: Callable[[int], GrayImage | None],
+    images: Array,
+    pixels: Array,
+    tangents: Array,
+    templates: _Templates,
+    which: Array,
+) -> None:
+    """Fill in some (k,) of the templates, with a border of a pixel for gradients."""
+    x, y = _grid(templates.patches.shape[1] // 2)
 
     def cut(part: tuple[int, Array]) -> None:
-        image, rows = part
-        read = read_gray(image)
-        if read is not None:
-            place = pixels[sources[rows]] / read.scale
-            gray = read.gray.astype(np.float32)
-            patches[rows] = _sample(gray, place[:, :1] + x, place[:, 1:] + y).reshape(-1, side, side)
-            scales[image] = read.scale
-            aligned[sources[rows]] = True
-
-    def align(part: tuple[int, Array]) -> None:
-        image, rows = part
+        image, mine = part
         read = read_gray(image)
         if read is None:
             return
-        own = templates[rows]
-        to_plane = _inverse(tangents[own] / scales[images[own], :, None])
-        chosen = position[rows]
-        place, aligned[rows] = _align_in_image(
-            read.gray.astype(np.float32),
-            pixels[rows] / read.scale,
-            tangents[rows] / read.scale[:, None] @ to_plane,
-            patches,
-            inverses,
-            chosen,
-            settings,
-        )
-        moved[rows] = np.where(aligned[rows, None], place * read.scale, pixels[rows])
+        rows = templates.rows[mine]
+        place = pixels[rows] / read.scale
+        patches = _sample(read.gray.astype(np.float32), place[:, :1] + x, place[:, 1:] + y)
+        templates.patches[mine] = patches.reshape(-1, *templates.patches.shape[1:])
+        templates.to_plane[mine] = _inverse(tangents[rows] / read.scale[:, None])
+        templates.present[mine] = True
 
-    # each image writes rows of its own, and OpenCV and numpy run without Python's lock
-    with ThreadPoolExecutor(settings.threads) as pool:
-        list(pool.map(cut, rows_of_each(images[sources])))
-        starts = range(0, len(sources), PATCHES_AT_ONCE)
-        inverses = np.concatenate(
-            [
-                np.zeros((0, 6, 6)),
-                *pool.map(lambda k: _inverse_normals(patches[k : k + PATCHES_AT_ONCE]), starts),
-            ]
-        )
-        usable &= aligned[templates]
-        position = np.searchsorted(sources, templates)
-        rows = np.nonzero(usable)[0]
-        list(pool.map(align, [(image, rows[mine]) for image, mine in rows_of_each(images[usable])]))
-    return moved, aligned
+    def invert(part: Array) -> None:
+        templates.inverses[part] = _inverse_normals(templates.patches[part])
+
+    of_images = [(image, which[mine]) for image, mine in rows_of_each(images[templates.rows[which]])]
+    starts = range(0, len(which), PATCHES_AT_ONCE)
+    # each image writes rows of its own
+    list(pool.map(cut, of_images))
+    list(pool.map(invert, [which[start : start + PATCHES_AT_ONCE] for start in starts]))
 
 
 def _grid(radius: int) -> tuple[Array, Array]:
@@ -181,33 +223,36 @@ def _sample(gray: Array, x: Array, y: Array) -> Array:
 
 
 def _align_in_image(
-    gray: Array,
+    read: GrayImage | None,
     pixels: Array,
-    warps: Array,
-    patches: Array,
-    inverses: Array,
+    tangents: Array,
+    templates: _Templates,
     chosen: Array,
     settings: AlignmentSettings,
 ) -> tuple[Array, Array]:
-    """Aligned pixels (M,2) of observations in one image, and which (M,) bool are to be trusted.
+    """Pixels (M,2) of observations in one image, and which (M,) bool were aligned; the others did not move.
 
-    The template of each observation and its inverse normal matrix are the rows ``chosen`` (M,) of
-    ``patches`` and ``inverses``.
+    The template of each observation is the row ``chosen`` (M,) of ``templates``.
     """
-    place, good = np.empty_like(pixels), np.empty(len(pixels), dtype=bool)
+    place, good = pixels.copy(), np.zeros(len(pixels), dtype=bool)
+    if read is None:
+        return place, good
+    gray, starts = read.gray.astype(np.float32), pixels / read.scale
+    warps = tangents / read.scale[:, None] @ templates.to_plane[chosen]
     for start in range(0, len(pixels), PATCHES_AT_ONCE):
         part = slice(start, start + PATCHES_AT_ONCE)
         own = chosen[part]
-        place[part], good[part] = _align_patches(
-            gray, pixels[part], warps[part], patches[own], inverses[own], settings
+        found, good[part] = _align_patches(
+            gray, starts[part], warps[part], templates.patches[own], templates.inverses[own], settings
         )
+        place[part] = np.where(good[part, None], found * read.scale, pixels[part])
     return place, good
 
 
 def _align_patches(
     gray: Array, pixels: Array, warps: Array, templates: Array, inverse: Array, settings: AlignmentSettings
 ) -> tuple[Array, Array]:
-    """The same for observations (M,) that are few enough, with their templates (M,S,S)."""
+    """The same in pixels of the gray image, for so few that arrays stay small, with templates (M,S,S)."""
     radius = settings.radius_px
     grid, window = np.stack(_grid(radius)), _window(radius)
     wanted, slopes = _prepare(templates, grid)

@@ -48,7 +48,8 @@ def _options(settings: SolverSettings) -> pycolmap.BundleAdjustmentOptions:
     solver = ceres.solver_options
     solver.max_num_iterations = settings.max_iterations
     solver.function_tolerance = settings.function_tolerance
-    solver.num_threads = settings.threads
+    # on several threads sums are added in any order, so results would differ from run to run
+    solver.num_threads = 1
     # a robust loss needs few iterations if points follow the cameras; Ceres ends this where it gains little
     solver.use_inner_iterations = settings.inner_iterations
     solver.inner_iteration_tolerance = INNER_TOLERANCE

@@ -10,11 +10,12 @@ import numpy as np
 
 from snakesfm.arrays import Array
 from snakesfm.bundle.alignment import AlignmentSettings, GrayImage
+from snakesfm.geometry.detector_sides import USUAL_SIDE_PX
 
 if TYPE_CHECKING:
     from snakesfm.ingest.read import ImagePixels
 
-HELD_PIXELS = 256 * 760 * 1140
+HELD_PIXELS = 256 * USUAL_SIDE_PX * (USUAL_SIDE_PX * 3 // 2)
 """Gray values that are kept, as each image is read twice: those of so many photographs of usual size."""
 LEAST_GAIN = 1.25
 """Images that are less finer than those before tell nothing new."""

@@ -20,7 +20,6 @@ class SolverSettings:
     constant_rotations : hold all rotations.
     max_iterations, function_tolerance : when the solver stops.
     inner_iterations : Ceres adjusts points and cameras by turns after each step: fewer, but dearer ones.
-    threads : of the solver.
     """
 
     loss: Loss = "cauchy"
@@ -33,7 +32,6 @@ class SolverSettings:
     max_iterations: int = 100
     function_tolerance: float = 1e-6
     inner_iterations: bool = True
-    threads: int = 1
 
 
 class BundleAdjuster(Protocol):

@@ -13,7 +13,7 @@ from snakesfm.bundle.reading import read_tracks_and_pixels
 from snakesfm.geometry.camera import Camera, observation_errors
 from snakesfm.geometry.colmap_binding import pycolmap
 from snakesfm.geometry.colmap_writing import with_observations
-from snakesfm.geometry.poses import to_rigid3d
+from snakesfm.geometry.poses import has_pose, to_rigid3d
 from snakesfm.grouping import offsets_of
 
 
@@ -43,7 +43,7 @@ class BundleModel:
     @property
     def registered(self) -> Array:
         """Which images (N,) bool have a pose."""
-        return np.asarray(np.isfinite(self.rotations[:, 0, 0]) & np.isfinite(self.translations[:, 0]))
+        return has_pose(self.rotations, self.translations)
 
 
 def restrict_to(model: BundleModel, images: Array) -> BundleModel:

@@ -70,17 +70,18 @@ def adjust_rounds(
     mapper = _Mapper(reconstruction, read_graph, cameras, solving, settings, report)
     last = len(settings.thresholds_px) - 1
     if settings.rotations_first:
-        mapper.round("rotations fixed", settings.thresholds_px[0] * 2, constant_rotations=True)
+        mapper.round("rotations fixed", settings.thresholds_px[0] * 2, "early", number=0)
     for row, threshold in enumerate(settings.thresholds_px):
+        number = row + 1
         phase: Phase = "final" if row == last else "early"
         refining = sources if row == max(last - 1, 0) else ()
         # what completion adds is not refined, so it ends where refinement begins
         completing = bool(row) and settings.complete_tracks and (not sources or row < last)
         mapper.prepare(completing, refining)
-        mapper.round(f"round {row + 1}", threshold, phase)
-        if row == max(last - 1, 0) and mapper.widen_lenses():
+        mapper.round(f"round {number}", threshold, phase, number)
+        if row == max(last - 1, 0) and mapper.widen_lenses(number):
             mapper.prepare(completing, refining)
-            mapper.round(f"round {row + 1} with wider lenses", threshold, phase)
+            mapper.round(f"round {number} with wider lenses", threshold, phase, number)
     while settings.register_images and mapper.register():
         mapper.round("registration", settings.thresholds_px[-1], "final")
     if settings.refine_principal_points and settings.solver == "ceres":
@@ -118,36 +119,51 @@ class _Mapper:
         self.adjust = bundle_adjuster(settings.solver)
         self.held_graph: pycolmap.CorrespondenceGraph | None = None
 
-    def round(
-        self, name: str, threshold_px: float, phase: Phase = "early", constant_rotations: bool = False
-    ) -> None:
+    def round(self, name: str, threshold_px: float, phase: Phase, number: int = 0) -> None:
         """One pass of the solver and the filters after it; all but the last are coarse.
 
-        The first of several holds the distortion, which would make up for a wrong focal length. A camera
-        gone wild is held until the pass ends: the next one starts from better poses and points.
+        Early rounds of a low number hold the distortion, which would make up for a wrong focal length. A
+        camera gone wild is held until the pass ends: the next one starts from better poses and points.
         """
         settings = self.settings
-        solving = replace(self.solving, constant_rotations=constant_rotations)
-        if phase != "last":
-            solving = replace(solving, function_tolerance=solving.function_tolerance * EARLY_TOLERANCE)
-        if phase != "early":
+        if phase == "early":
+            solving = self.early_solving(threshold_px, number)
+        else:
             # the solver takes most memory here, and few models need their matches again
             self.held_graph = None
-            solving = replace(
-                solving,
-                loss=settings.last_loss if phase == "last" else solving.loss,
-                loss_scale_px=self.loss_scale_px(),
-            )
-        else:
-            solving = replace(
-                solving,
-                loss_scale_px=settings.early_loss_share * threshold_px,
-                # the few steps of a coarse pass cost less than these need to be prepared
-                inner_iterations=False,
-                refine_distortion=solving.refine_distortion
-                and len(self.records) + 1 >= settings.distortion_from_round,
-            )
+            solving = self.late_solving(phase)
         drop_short_tracks(self.reconstruction, settings.min_track_length, settings.sparse_observations)
+        costs, wild, held = self.solve_with_wild_held(solving, phase)
+        self.filter(threshold_px)
+        if phase != "early":
+            deregister_weak_images(self.reconstruction, settings.min_observations)
+        self.record(name, costs, wild, held)
+
+    def early_solving(self, threshold_px: float, number: int) -> SolverSettings:
+        """How a round before the final ones is solved; round 0 holds all rotations."""
+        settings, solving = self.settings, self.solving
+        return replace(
+            solving,
+            function_tolerance=solving.function_tolerance * EARLY_TOLERANCE,
+            loss_scale_px=settings.early_loss_share * threshold_px,
+            # the few steps of a coarse pass cost less than these need to be prepared
+            inner_iterations=False,
+            refine_distortion=solving.refine_distortion and number >= settings.distortion_from_round,
+            constant_rotations=number == 0,
+        )
+
+    def late_solving(self, phase: Literal["final", "last"]) -> SolverSettings:
+        """How a pass is solved on the model as it is, whose noise tells where the loss sets in."""
+        solving = replace(self.solving, loss_scale_px=self.loss_scale_px())
+        if phase == "last":
+            return replace(solving, loss=self.settings.last_loss)
+        return replace(solving, function_tolerance=solving.function_tolerance * EARLY_TOLERANCE)
+
+    def solve_with_wild_held(
+        self, solving: SolverSettings, phase: Phase
+    ) -> tuple[tuple[float, float], Mapping[int, WildCause], Mapping[int, WildCause]]:
+        """One pass, solved again with the cameras held that went wild; its costs, these, and those held."""
+        settings = self.settings
         before = {k: list(camera.params) for k, camera in self.reconstruction.cameras.items()}
         costs = self.solve(solving, phase)
         wild = reset_wild_cameras(
@@ -158,19 +174,16 @@ class _Mapper:
             settings.max_guessed_focal_change,
             settings.max_distortion,
         )
+        if not wild:
+            return costs, wild, wild
         gone: Set[int] = frozenset()
-        if wild:
-            if phase == "last" and settings.register_images:
-                # no pass is left for their focal lengths: their images are added to the finished model
-                stray = {camera_id for camera_id, cause in wild.items() if cause == "focal length"}
-                gone = deregister_images_alone(self.reconstruction, stray)
-            constant = solving.constant_cameras | frozenset(wild)
-            costs = self.solve(replace(solving, constant_cameras=constant), phase)
-        self.filter(threshold_px)
-        if phase != "early":
-            deregister_weak_images(self.reconstruction, settings.min_observations)
-        held = {camera_id: cause for camera_id, cause in wild.items() if camera_id not in gone}
-        self.record(name, costs, wild, held)
+        if phase == "last" and settings.register_images:
+            # no pass is left for their focal lengths: their images are added to the finished model
+            stray = {camera_id for camera_id, cause in wild.items() if cause == "focal length"}
+            gone = deregister_images_alone(self.reconstruction, stray)
+        constant = solving.constant_cameras | frozenset(wild)
+        costs = self.solve(replace(solving, constant_cameras=constant), phase)
+        return costs, wild, {k: cause for k, cause in wild.items() if k not in gone}
 
     def prepare(self, completing: bool, sources: Sequence[ImageSource]) -> None:
         """What comes before a round: tracks are completed, and keypoints refined by each of ``sources``."""
@@ -182,18 +195,13 @@ class _Mapper:
             )
             source.release()
 
-    def widen_lenses(self) -> bool:
-        """Give cameras whose lens is not of their model a wider one; whether there were some."""
+    def widen_lenses(self, number: int) -> bool:
+        """After a round, give cameras whose lens is not of their model a wider one; whether some were."""
         settings = self.settings
-        told = len(self.records) >= settings.distortion_from_round
+        told = number >= settings.distortion_from_round
         if not settings.widen_lenses or not told or settings.solver != "ceres":
             return False
-        solving = replace(
-            self.solving,
-            loss_scale_px=self.loss_scale_px(),
-            function_tolerance=self.solving.function_tolerance * EARLY_TOLERANCE,
-        )
-        wider = find_wider_lenses(self.reconstruction, self.adjust, solving)
+        wider = find_wider_lenses(self.reconstruction, self.adjust, self.late_solving("final"))
         for camera_id, camera in wider.items():
             set_camera(self.reconstruction, camera_id, camera)
             # what went wild later would else go back to the former model
@@ -206,8 +214,7 @@ class _Mapper:
         skewed = skewed_cameras(self.reconstruction, self.cameras)
         if not skewed or settings.solver != "ceres":
             return
-        solving = replace(self.solving, loss=settings.last_loss, loss_scale_px=self.loss_scale_px())
-        if not one_focal_serves(self.reconstruction, skewed, self.adjust, solving):
+        if not one_focal_serves(self.reconstruction, skewed, self.adjust, self.late_solving("last")):
             return
         starts = list(self.cameras)
         for camera_id in skewed:

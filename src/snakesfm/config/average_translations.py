@@ -10,7 +10,7 @@ from snakesfm.config.base import StageOptions
 class AverageTranslationsOptions(StageOptions):
     """Options of positioning the cameras, their rotations being known."""
 
-    stage_version: ClassVar[int] = 9
+    stage_version: ClassVar[int] = 10
 
     method: Literal["scale_chain", "translation_recovery", "global_positioning"] = "scale_chain"
     """Initial positions: from baseline ratios of shared landmarks, gtsam's TranslationRecovery, or
@@ -55,7 +55,8 @@ class AverageTranslationsOptions(StageOptions):
     """Start of global_positioning: random positions, as in GLOMAP, or the result of scale_chain."""
 
     max_edge_residual_deg: float = Field(default=5.0, gt=0, le=180)
-    """Two-view directions that differ from the estimated centres by more degrees do not count as used."""
+    """A two-view direction supports its cameras' positions if it differs from them by fewer degrees; in
+    translation_recovery, 'residual' rejects the others."""
 
     min_support: int = Field(default=6, ge=1)
     """A camera keeps its position if at least this many of its rays agree with their landmarks."""

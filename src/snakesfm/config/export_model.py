@@ -16,5 +16,9 @@ class ExportModelOptions(StageOptions):
     link_images: bool = True
     """Link the images next to the model, so that COLMAP and nerfstudio can read the folder directly."""
 
+    all_keypoints: bool = False
+    """Write all keypoints of registered images, numbered as in the COLMAP database and in hloc's files, so
+    that COLMAP can continue the model and hloc can localise images in it; otherwise only observations."""
+
     undistort: bool = False
     """Also write images, masks and a model with PINHOLE cameras to 'undistorted', for Inria's 3DGS."""

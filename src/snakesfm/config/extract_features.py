@@ -5,6 +5,7 @@ from typing import Annotated, ClassVar, Literal, Self
 from pydantic import Field, model_validator
 
 from snakesfm.config.base import StageOptions
+from snakesfm.geometry.detector_sides import USUAL_SIDE_PX
 
 
 class ExtractFeaturesOptions(StageOptions):
@@ -27,7 +28,7 @@ class ExtractFeaturesOptions(StageOptions):
     """Number of points 'virtual' spreads over the view of each image, without occlusion; 0 turns this
     off."""
 
-    max_shorter_side_px: int = Field(760, ge=64, le=20_000)
+    max_shorter_side_px: int = Field(USUAL_SIDE_PX, ge=64, le=20_000)
     """Shorter side to which larger images are scaled down; keypoint coordinates stay in original pixels."""
 
     contrast_threshold: float = Field(0.01, ge=0.0, le=0.5)

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from snakesfm.config.evaluate_model import EvaluateModelOptions
 from snakesfm.errors import SnakesfmError
 from snakesfm.evaluation.colmap_model import model_poses, read_model
 from snakesfm.evaluation.metrics import evaluate_poses, model_metrics
@@ -29,7 +30,8 @@ def main(arguments: list[str] | None = None) -> int:
     lengths = [point.track.length() for point in points]
     registered = np.array([image.has_pose for image in model.images.values()], dtype=bool)
     errors = np.array([point.error for point in points], dtype=np.float64)
-    evaluation = evaluate_poses(model_poses(model), model_poses(reference))
+    defaults = EvaluateModelOptions().model_dump()
+    evaluation = evaluate_poses(model_poses(model), model_poses(reference), **defaults)
     content: dict[str, object] = {
         **model_metrics(registered, offsets_of(lengths), errors),
         **evaluation.metrics,

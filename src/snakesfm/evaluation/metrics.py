@@ -14,14 +14,11 @@ from snakesfm.evaluation.pose_errors import (
     pose_auc,
     relative_pose_errors,
 )
-from snakesfm.geometry.poses import center_of
+from snakesfm.geometry.poses import center_of, has_pose
 from snakesfm.geometry.rotations import angle_between
 from snakesfm.image_names import match_names
 
 Metrics = dict[str, float | int | None]
-RELATIVE_THRESHOLDS_DEG = (1.0, 3.0, 5.0, 10.0, 20.0)
-GLOBAL_THRESHOLDS_DEG = (1.0, 2.5, 5.0, 10.0, 20.0)
-MIN_BASELINE_RATIO = 1e-6
 
 
 @dataclass(frozen=True)
@@ -35,8 +32,7 @@ class Poses:
     @property
     def registered(self) -> Array:
         """Which images have a pose, (n,) bool."""
-        rotations, translations = np.isfinite(self.rotations), np.isfinite(self.translations)
-        return np.asarray(rotations.all(axis=(1, 2)) & translations.all(axis=1))
+        return has_pose(self.rotations, self.translations)
 
     @property
     def centers(self) -> Array:
@@ -75,9 +71,9 @@ class PoseEvaluation:
 def evaluate_poses(
     model: Poses,
     reference: Poses,
-    relative_thresholds_deg: Sequence[float] = RELATIVE_THRESHOLDS_DEG,
-    global_thresholds_deg: Sequence[float] = GLOBAL_THRESHOLDS_DEG,
-    min_baseline_ratio: float = MIN_BASELINE_RATIO,
+    relative_thresholds_deg: Sequence[float],
+    global_thresholds_deg: Sequence[float],
+    min_baseline_ratio: float,
 ) -> PoseEvaluation:
     """Compare a model's poses to reference poses.
 

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from snakesfm.arrays import Array
-from snakesfm.geometry.poses import center_of
+from snakesfm.geometry.poses import center_of, has_pose
 from snakesfm.geometry.rotations import angle_between
 
 FAILED_DEG = 180.0
@@ -73,9 +73,7 @@ def relative_pose_errors(
         error is 0 where the reference has none and 180 where only the model has none.
     """
     count = len(reference_rotations)
-    registered: Array = np.asarray(
-        np.isfinite(rotations).all(axis=(1, 2)) & np.isfinite(translations).all(axis=1)
-    )
+    registered = has_pose(rotations, translations)
     model_rotations = np.where(registered[:, None, None], rotations, np.eye(3))
     centers = center_of(model_rotations, np.where(registered[:, None], translations, 0.0))
     reference_centers = center_of(reference_rotations, reference_translations)

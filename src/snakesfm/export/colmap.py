@@ -9,13 +9,8 @@ from snakesfm.arrays import Array
 from snakesfm.geometry.camera import Camera
 from snakesfm.geometry.colmap_binding import pycolmap
 from snakesfm.geometry.colmap_writing import keypoints_of_observations, with_observations
-from snakesfm.geometry.poses import to_rigid3d
-
-
-def registered_images(rotations: Array, translations: Array) -> Array:
-    """Rows (n,) of the images that have a pose."""
-    finite = np.isfinite(rotations).all(axis=(1, 2)) & np.isfinite(translations).all(axis=1)
-    return np.flatnonzero(finite)
+from snakesfm.geometry.poses import has_pose, to_rigid3d
+from snakesfm.grouping import rows_of_each
 
 
 def build_reconstruction(
@@ -30,12 +25,12 @@ def build_reconstruction(
     offsets: Array,
     image_ids: Array,
     keypoints: Array,
+    others: tuple[Array, Sequence[Array]] | None = None,
 ) -> pycolmap.Reconstruction:
     """A pycolmap reconstruction of the registered images.
 
     Ids are rows plus one: image k of the index is COLMAP image k + 1, so too for cameras and points.
-    Cameras without a registered image are left out. The points2D of an image are its observations that
-    belong to a point, in the order of the points.
+    Cameras without a registered image are left out.
 
     Parameters
     ----------
@@ -44,13 +39,16 @@ def build_reconstruction(
     rotations, translations : (N,3,3), (N,3) cam_from_world; NaN where not registered.
     points, colors, errors_px : (T,3) float64, (T,3) uint8 RGB, (T,) mean reprojection error in pixels.
     offsets, image_ids, keypoints : (T+1,), (L,), (L,2): observations of the points, in original pixels.
+    others : the observation's row (L,) among the keypoints of its image, and per image all of these
+        (K_i,2), which become its points2D; the points2D of None are the observations in the order of the
+        points.
 
     Raises
     ------
     ValueError : a point is observed by an image that is not registered.
     ConfigError : the installed pycolmap has binary files of another layout.
     """
-    registered = registered_images(rotations, translations)
+    registered = np.flatnonzero(has_pose(rotations, translations))
     if not np.isin(image_ids, registered).all():
         raise ValueError("points are observed by images without a pose")
     model = pycolmap.Reconstruction()
@@ -59,7 +57,13 @@ def build_reconstruction(
     for row in registered.tolist():
         image = pycolmap.Image(name=names[row], camera_id=int(camera_ids[row]) + 1, image_id=row + 1)
         model.add_image_with_trivial_frame(image, to_rigid3d(rotations[row], translations[row]))
-    per_image, keypoint_ids = keypoints_of_observations(image_ids, keypoints, len(names))
+    if others is None:
+        per_image, keypoint_ids = keypoints_of_observations(image_ids, keypoints, len(names))
+    else:
+        keypoint_ids, per_image = others[0], [np.array(found, np.float64) for found in others[1]]
+        # what was observed was refined
+        for image, mine in rows_of_each(image_ids):
+            per_image[image][keypoint_ids[mine]] = keypoints[mine]
     return with_observations(model, per_image, points, offsets, image_ids, keypoint_ids, colors, errors_px)
 
 

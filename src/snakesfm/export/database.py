@@ -82,9 +82,7 @@ def sift_descriptors(descriptors: Array) -> pycolmap.FeatureDescriptors:
     )
 
 
-def calibrated_geometry(
-    rotation: Array, translation: Array, inliers: Array, angle_deg: float
-) -> pycolmap.TwoViewGeometry:
+def calibrated_geometry(rotation: Array, translation: Array, inliers: Array) -> pycolmap.TwoViewGeometry:
     """An accepted pair as COLMAP's calibrated two-view geometry: pose, essential matrix and inliers.
 
     Planar scenes are calibrated pairs too, because their pose is known and agrees with all inliers.
@@ -93,7 +91,6 @@ def calibrated_geometry(
     ----------
     rotation, translation : (3,3), (3,) unit: pose of the second camera from the first.
     inliers : (M,2) keypoint rows in the first and in the second image.
-    angle_deg : median triangulation angle in degrees; NaN where it is not known.
     """
     pose = to_rigid3d(rotation, translation)
     geometry = pycolmap.TwoViewGeometry()
@@ -101,8 +98,6 @@ def calibrated_geometry(
     geometry.E = pycolmap.essential_matrix_from_pose(pose)
     geometry.cam2_from_cam1 = pose
     geometry.inlier_matches = np.ascontiguousarray(inliers, dtype=np.uint32).reshape(-1, 2)
-    if np.isfinite(angle_deg):
-        geometry.tri_angle = float(np.radians(angle_deg))
     return geometry
 
 
@@ -123,5 +118,4 @@ def panoramic_geometry(
     geometry.H = second @ rotation @ np.linalg.inv(first)
     geometry.cam2_from_cam1 = to_rigid3d(rotation, np.zeros(3))
     geometry.inlier_matches = np.ascontiguousarray(inliers, dtype=np.uint32).reshape(-1, 2)
-    geometry.tri_angle = 0.0
     return geometry

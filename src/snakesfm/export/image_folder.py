@@ -12,6 +12,7 @@ from snakesfm.arrays import Array
 UPRIGHT = (0, 1)
 EXIF_MARK = b"Exif\0\0"
 ORIENTATION = 0x0112
+BIG_TIFF = 43
 # of EXIF's types SHORT and LONG
 VALUE_FORMATS = {3: "H", 4: "I"}
 
@@ -31,9 +32,11 @@ def place_images(target: Path, images: Path, names: Sequence[str], orientations:
     names : images relative to it; the files that are placed where one link does not do.
     orientations : (N,) EXIF orientation of each image.
     """
+    # the folder of the photographs may be given as the very link that is made here
+    images = images.resolve()
     if target.is_symlink() or target.is_file():
         target.unlink()
-    elif target.is_dir() and target.resolve() == images.resolve():
+    elif target.is_dir() and target.resolve() == images:
         return
     elif target.is_dir():
         shutil.rmtree(target)
@@ -83,11 +86,15 @@ def _write_unturned(source: Path, place: Path) -> None:
 
 
 def _set_upright(content: bytearray, start: int) -> None:
-    """Set the orientation in the first directory of the TIFF structure at ``start`` to 1."""
+    """Set the orientation in the first directory of the TIFF or BigTIFF structure at ``start`` to 1."""
     order = "<" if content[start : start + 2] == b"II" else ">"
-    (directory,) = struct.unpack_from(f"{order}I", content, start + 4)
-    (entries,) = struct.unpack_from(f"{order}H", content, start + directory)
-    for entry in range(start + directory + 2, start + directory + 2 + 12 * entries, 12):
+    (magic,) = struct.unpack_from(f"{order}H", content, start + 2)
+    # of where the directory is, of its length and of an entry, and where the entry has its value
+    at, offset, length, size, value = (8, "Q", "Q", 20, 12) if magic == BIG_TIFF else (4, "I", "H", 12, 8)
+    (directory,) = struct.unpack_from(order + offset, content, start + at)
+    (entries,) = struct.unpack_from(order + length, content, start + directory)
+    first = start + directory + struct.calcsize(order + length)
+    for entry in range(first, first + size * entries, size):
         tag, kind = struct.unpack_from(f"{order}HH", content, entry)
         if tag == ORIENTATION and kind in VALUE_FORMATS:
-            struct.pack_into(order + VALUE_FORMATS[kind], content, entry + 8, 1)
+            struct.pack_into(order + VALUE_FORMATS[kind], content, entry + value, 1)

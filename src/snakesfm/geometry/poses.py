@@ -28,6 +28,12 @@ class Similarity:
         return rotations @ self.rotation.T
 
 
+def has_pose(rotations: Array, translations: Array) -> Array:
+    """Which (...) bool of cam_from_world poses (...,3,3) and (...,3) are known; NaN marks the others."""
+    turned = np.isfinite(rotations).all(axis=(-2, -1))
+    return np.asarray(turned & np.isfinite(translations).all(axis=-1))
+
+
 def center_of(rotations: Array, translations: Array) -> Array:
     """Camera centres (..., 3) in the world of cam_from_world poses: -R^T t."""
     centers: Array = -np.einsum("...ji,...j->...i", rotations, translations)

@@ -1,29 +1,28 @@
 """The images of an index, read as they were when they were indexed."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from snakesfm.artifacts.images import ImageIndex
+from snakesfm.arrays import Array
 from snakesfm.errors import ImageError
 from snakesfm.ingest.read import ImagePixels, read_image
 
-if TYPE_CHECKING:
-    from snakesfm.stages.job import StageJob
-
 
 class IndexedImages:
-    """Reads the images of an index, and keeps count of those that cannot be decoded.
+    """Reads the images of an index, and notes those that cannot be decoded.
 
     Parameters
     ----------
-    index : which images there are, with the SHA-256 of their files.
+    names : (N) str, images of the index, relative to the folder.
+    sha256 : (N) str, of their files, hexadecimal.
     folder : the image folder.
     """
 
-    def __init__(self, index: ImageIndex, folder: Path) -> None:
-        self._index = index
+    def __init__(self, names: Array, sha256: Array, folder: Path) -> None:
+        self._names = names
+        self._sha256 = sha256
         self._folder = folder
-        self._damaged: dict[int, str] = {}
+        self.damaged: dict[int, str] = {}
+        """What is wrong with the images that could not be decoded, a sentence each, by row."""
 
     def read(self, row: int, shorter_side_px: int | None = None) -> ImagePixels | None:
         """The pixels of an image, or None with a warning in the log where they cannot be decoded.
@@ -37,17 +36,11 @@ class IndexedImages:
         ------
         SceneError : the file cannot be read now, or is another than when it was indexed.
         """
-        path = self._folder / str(self._index.names[row])
+        path = self._folder / str(self._names[row])
         try:
-            return read_image(path, shorter_side_px, str(self._index.sha256[row]))
+            return read_image(path, shorter_side_px, str(self._sha256[row]))
         except ImageError as error:
-            if row not in self._damaged:
+            if row not in self.damaged:
                 print(f"warning: {error}", flush=True)
-            self._damaged[row] = str(error)
+            self.damaged[row] = str(error)
             return None
-
-    def warn_of_damaged(self, job: "StageJob") -> None:
-        """Tell the user of the images that could not be decoded."""
-        if self._damaged:
-            first = self._damaged[min(self._damaged)]
-            job.warn(f"{len(self._damaged)} images cannot be decoded and are left out, first: {first}")

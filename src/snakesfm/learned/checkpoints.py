@@ -4,9 +4,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from snakesfm.digests import sha256_of
 from snakesfm.errors import ConfigError
 from snakesfm.learned.device import choose_device, load_torch
-from snakesfm.learned.weights import WEIGHT_FILES, file_sha256, find_weights, read_sums
+from snakesfm.learned.weights import WEIGHT_FILES, find_weights, read_sums
 
 # keys under which makers put the parameters beside other things of their training
 CONTAINERS = ("state_dict", "extractor", "model")
@@ -33,7 +34,7 @@ def read_checkpoint(model: str, folder: Path, command: str) -> Mapping[str, Any]
     expected = ""
     if not folder.is_file():
         expected = WEIGHT_FILES[model].sha256 or read_sums(folder).get(path.name, "")
-    if expected and file_sha256(path) != expected:
+    if expected and sha256_of(path) != expected:
         raise ConfigError(
             f"{path} is not the expected file for '{model}' (its SHA-256 differs): remove it and run "
             f"'{command}'."

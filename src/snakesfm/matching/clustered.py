@@ -60,7 +60,7 @@ class ClusteredSearch:
         words : size of the codebook, 256 at most; images with few descriptors get a smaller one.
         probes : words that a descriptor probes, on average over the image.
         """
-        centers = learn_codebook(descriptors, min(words, max(1, len(descriptors) // MIN_PER_WORD)))
+        centers = learn_small_codebook(descriptors, min(words, max(1, len(descriptors) // MIN_PER_WORD)))
         vectors = augmented(descriptors, norm_first=True)
         word, row = np.nonzero(_probed(vectors[:, :-2], centers, probes).T)
         by_row = np.argsort(row, kind="stable")
@@ -129,7 +129,7 @@ class ClusteredSearch:
         return nearest, first, second, column_first
 
 
-def learn_codebook(descriptors: Array, words: int) -> Array:
+def learn_small_codebook(descriptors: Array, words: int) -> Array:
     """Centres (W,D) float32 of a short k-means on evenly spaced rows, integers if the descriptors are.
 
     Parameters

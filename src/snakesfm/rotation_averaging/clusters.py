@@ -48,7 +48,7 @@ def vote_between_clusters(
     if inside.all() and confirmed[reasons == "kept"].all():
         return reasons
     weights = inlier_counts.astype(np.float64)
-    joining, frames = join_clusters(node_count, pairs, rotations, weights, core, tolerance_rad)
+    joining, frames = join_by_votes(node_count, pairs, rotations, weights, core, tolerance_rad)
     heads, tails = frames[pairs[:, 0]], frames[pairs[:, 1]]
     residuals = angle_of(tails.transpose(0, 2, 1) @ rotations @ heads)
     fitting = residuals <= np.where(confirmed, 1.0, LOOSE) * tolerance_rad
@@ -56,7 +56,7 @@ def vote_between_clusters(
     return np.where(kept, "kept", np.where(reasons == "kept", "cluster_vote", reasons)).astype(object)
 
 
-def join_clusters(
+def join_by_votes(
     node_count: int, pairs: Array, rotations: Array, weights: Array, trusted: Array, tolerance_rad: float
 ) -> tuple[Array, Array]:
     """Choose the edges that join clusters: those that most of the inlier matches agree on.

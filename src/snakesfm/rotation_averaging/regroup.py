@@ -4,7 +4,7 @@ import numpy as np
 
 from snakesfm.arrays import Array
 from snakesfm.rotation_averaging.base import RotationGraph, edge_residuals
-from snakesfm.rotation_averaging.clusters import join_clusters
+from snakesfm.rotation_averaging.clusters import join_by_votes
 from snakesfm.view_graph.bridges import find_bridges
 
 
@@ -27,4 +27,4 @@ def regroup_nodes(graph: RotationGraph, averaged: Array, tolerance_rad: float) -
     rows = np.flatnonzero(holding)
     holding[rows[find_bridges(graph.node_count, graph.pairs[rows])]] = False
     votes = np.sqrt(graph.weights)
-    return join_clusters(graph.node_count, graph.pairs, graph.rotations, votes, holding, tolerance_rad)[1]
+    return join_by_votes(graph.node_count, graph.pairs, graph.rotations, votes, holding, tolerance_rad)[1]

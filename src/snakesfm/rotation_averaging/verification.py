@@ -13,7 +13,7 @@ from snakesfm.view_graph.components import label_components
 from snakesfm.view_graph.filters import keep_largest_component
 
 
-def average_components(
+def average_rotation_components(
     averager: RotationAverager,
     graph: RotationGraph,
     reasons: Array,

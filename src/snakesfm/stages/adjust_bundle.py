@@ -94,10 +94,11 @@ def run(job: StageJob) -> None:
         prefix = f"part {component + 1}, " if component else ""
         result, observed, rounds = _adjust(job, index, part, graph, refused, taken, prefix)
         records += rounds
-        resets |= rounds[-1].held
-        far |= rounds[-1].far
-        cameras = result.cameras
+        # intrinsics of a part that came apart must not reach the others
         if result.registered.sum() >= 2:
+            resets |= rounds[-1].held
+            far |= rounds[-1].far
+            cameras = result.cameras
             adjusted.append((result, observed))
             taken |= result.registered
     if not adjusted:
@@ -221,7 +222,7 @@ def _image_sources(job: StageJob, index: ImageIndex) -> list[ImageSource]:
 
     options: AdjustBundleOptions = job.options
     return open_image_sources(
-        IndexedImages(index, Path(job.settings["images"])).read,
+        IndexedImages(index.names, index.sha256, Path(job.settings["images"])).read,
         index.sizes,
         detector_scales(index.sizes, job.settings),
         options.refine_finenesses,

@@ -11,7 +11,7 @@ from snakesfm.artifacts.pairs import EDGE_LABELS, ViewGraph
 from snakesfm.errors import SceneError
 from snakesfm.rotation_averaging.base import RotationGraph, edge_residuals
 from snakesfm.rotation_averaging.registry import make_averager
-from snakesfm.rotation_averaging.verification import average_components
+from snakesfm.rotation_averaging.verification import average_rotation_components
 from snakesfm.stages.job import StageJob
 
 if TYPE_CHECKING:
@@ -43,7 +43,7 @@ def run(job: StageJob) -> None:
         graph.covariances[:, :3, :3],
     )
     filtered = reasons == "kept"
-    rotations, reasons, components = average_components(
+    rotations, reasons, components = average_rotation_components(
         make_averager(options.method),
         whole,
         reasons,

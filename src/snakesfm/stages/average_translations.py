@@ -1,5 +1,7 @@
 """Stage average_translations: camera centres from averaged rotations, the view graph and the tracks."""
 
+from collections.abc import Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -9,9 +11,9 @@ from snakesfm.artifacts.images import CalibratedCameras, ImageIndex
 from snakesfm.artifacts.mapping import CameraCenters, CameraRotations, TrackTable
 from snakesfm.artifacts.pairs import KINDS, ViewGraph
 from snakesfm.errors import SceneError
-from snakesfm.geometry.camera import cameras_from_columns, undistort
+from snakesfm.geometry.camera import Camera, cameras_from_columns, undistort
 from snakesfm.stages.job import StageJob
-from snakesfm.translation_averaging.average import DOUBTFUL_SHARE, average_components
+from snakesfm.translation_averaging.average import DOUBTFUL_SHARE, PositioningSettings, position_components
 from snakesfm.translation_averaging.averagers import (
     GlobalPositioning,
     ScaleChain,
@@ -51,90 +53,105 @@ def run(job: StageJob) -> None:
     graph = ViewGraph.read(job.path("graph"))
     averaged = CameraRotations.read(job.path("rotations"))
     tracks = TrackTable.read(job.path("tracks"))
-    rotations = averaged.rotations
-    turned = np.isfinite(rotations[:, 0, 0])
-
-    usable = (
-        (graph.labels == 0) & (averaged.labels == 0) & turned[graph.pairs[:, 0]] & turned[graph.pairs[:, 1]]
+    problem, usable = _problem(index, cameras, graph, averaged, tracks)
+    settings = positioning_settings(options, job.seed_for("positions"))
+    result = position_components(problem, averaged.components, settings)
+    placed = int(np.isfinite(result.centers[:, 0]).sum())
+    if placed < 2:
+        raise SceneError(
+            f"Scene '{job.scene}': no two images could be positioned from {len(problem.pairs)} image pairs "
+            f"and {len(tracks.offsets) - 1} tracks: add images from different positions with more overlap, "
+            "or mask borders and captions that all images share."
+        )
+    agreeing = result.ray_residuals_rad < settings.limits.ray_rad
+    if np.count_nonzero(agreeing) < DOUBTFUL_SHARE * len(agreeing):
+        job.warn(DOUBTFUL.format(percent=100 * np.mean(agreeing)))
+    edges_deg, rays_deg = np.full(len(graph.pairs), np.nan), np.degrees(result.ray_residuals_rad)
+    edges_deg[usable] = np.degrees(result.edge_residuals_rad)
+    turned = int(np.isfinite(averaged.rotations[:, 0, 0]).sum())
+    print(
+        f"{placed} of {turned} images with a rotation are positioned; median residuals: edges "
+        f"{_median(edges_deg):.2f} deg, rays {_median(rays_deg):.2f} deg"
     )
+    CameraCenters(
+        centers=result.centers,
+        edge_residuals_deg=edges_deg,
+        ray_residuals_deg=rays_deg,
+    ).write(job.output, job.header)
+
+
+def _problem(
+    index: ImageIndex,
+    cameras: Sequence[Camera],
+    graph: ViewGraph,
+    averaged: CameraRotations,
+    tracks: TrackTable,
+) -> tuple[PositioningProblem, Array]:
+    """What images with a rotation tell of their positions, and which edges (E,) bool take part."""
+    turned = np.isfinite(averaged.rotations[:, 0, 0])
+    usable = (graph.labels == 0) & (averaged.labels == 0) & turned[graph.pairs].all(axis=1)
     usable &= (graph.kinds != KINDS.index("rotation_only")) & np.isfinite(graph.translations[:, 0])
     # a part that a look-alike joined to a track is a landmark of its own: positioning cannot throw out rays
     by_part = np.argsort(tracks.part_ids, kind="stable")
     image_ids, keypoints = tracks.image_ids[by_part], tracks.keypoints[by_part]
-    rows = turned[image_ids]
     normalized = undistort(cameras, index.camera_ids, image_ids, keypoints)
-    rows &= np.isfinite(normalized.sum(axis=1))
-    pairs = graph.pairs[usable].astype(np.int64)
-    images = image_ids[rows].astype(np.int64)
+    rows = turned[image_ids] & np.isfinite(normalized.sum(axis=1))
+    pairs, images = graph.pairs[usable].astype(np.int64), image_ids[rows].astype(np.int64)
     problem = PositioningProblem(
         image_count=len(index.names),
         pairs=pairs,
-        directions=edge_directions(rotations, pairs, graph.translations[usable]),
+        directions=edge_directions(averaged.rotations, pairs, graph.translations[usable]),
         sigmas_rad=direction_sigmas(graph.covariances[usable]),
         ray_images=images,
         ray_tracks=tracks.part_ids[by_part][rows].astype(np.int64),
-        rays=world_rays(rotations, images, normalized[rows]),
+        rays=world_rays(averaged.rotations, images, normalized[rows]),
     )
-    limits = SupportLimits(
-        sigma_rad=float(np.radians(options.ray_sigma_deg)),
-        edge_rad=float(np.radians(options.max_edge_residual_deg)),
-        min_support=options.min_support,
-        min_ratio=options.min_support_ratio,
-        max_relative_sigma=options.max_relative_sigma,
-    )
-    result = average_components(
-        problem,
-        averaged.components,
-        _averager(options),
-        limits,
+    return problem, usable
+
+
+def positioning_settings(options: "AverageTranslationsOptions", seed: int) -> PositioningSettings:
+    """What the options say."""
+    return PositioningSettings(
+        averager=translation_averager(options),
+        limits=SupportLimits(
+            sigma_rad=float(np.radians(options.ray_sigma_deg)),
+            edge_rad=float(np.radians(options.max_edge_residual_deg)),
+            min_support=options.min_support,
+            min_ratio=options.min_support_ratio,
+            max_relative_sigma=options.max_relative_sigma,
+        ),
         refine=options.refine,
         rays_per_camera=options.rays_per_camera,
         edge_weight=options.edge_weight,
         restarts=options.restarts,
-        seed=job.seed_for("positions"),
+        restart=GlobalPositioning(options.rays_per_camera, options.positioning_loss_scale, start=None),
+        seed=seed,
     )
-    placed = int(np.isfinite(result.centers[:, 0]).sum())
-    if placed < 2:
-        raise SceneError(
-            f"Scene '{job.scene}': no two images could be positioned from {len(pairs)} image pairs and "
-            f"{len(tracks.offsets) - 1} tracks: add images from different positions with more overlap, or "
-            "mask borders and captions that all images share."
-        )
-    agreeing = np.count_nonzero(result.ray_residuals_rad < limits.ray_rad)
-    if agreeing < DOUBTFUL_SHARE * len(result.ray_residuals_rad):
-        job.warn(DOUBTFUL.format(percent=100 * agreeing / len(result.ray_residuals_rad)))
-    residuals = np.full(len(graph.pairs), np.nan)
-    residuals[usable] = np.degrees(result.edge_residuals_rad)
-    print(
-        f"{placed} of {turned.sum()} images with a rotation are positioned; median residuals: edges "
-        f"{_median(residuals):.2f} deg, rays {_median(np.degrees(result.ray_residuals_rad)):.2f} deg"
-    )
-    CameraCenters(
-        centers=result.centers,
-        edge_residuals_deg=residuals,
-        edge_used=residuals < options.max_edge_residual_deg,
-        ray_track_ids=result.ray_tracks,
-        ray_residuals_deg=np.degrees(result.ray_residuals_rad),
-    ).write(job.output, job.header)
 
 
-def _averager(options: "AverageTranslationsOptions") -> TranslationAverager:
+def translation_averager(options: "AverageTranslationsOptions") -> TranslationAverager:
+    """The averager that the options name, and what it falls back to with the same options."""
+    recovery = TranslationRecovery(
+        rays_per_camera=options.recovery_rays_per_camera,
+        sigma=options.recovery_sigma,
+        reject_outliers=options.reject_outliers,
+        residual_rad=float(np.radians(options.max_edge_residual_deg)),
+        mfas_projections=options.mfas_projections,
+        mfas_weight=options.mfas_weight,
+        chain=None,
+    )
+    chain = ScaleChain(
+        rays_per_camera=options.rays_per_camera,
+        sigma_rad=float(np.radians(options.ray_sigma_deg)),
+        max_relative_sigma=options.max_relative_sigma,
+        fallback=recovery,
+    )
     if options.method == "translation_recovery":
-        return TranslationRecovery(
-            rays_per_camera=options.recovery_rays_per_camera,
-            sigma=options.recovery_sigma,
-            reject_outliers=options.reject_outliers,
-            residual_rad=float(np.radians(options.max_edge_residual_deg)),
-            mfas_projections=options.mfas_projections,
-            mfas_weight=options.mfas_weight,
-        )
+        return replace(recovery, chain=chain)
     if options.method == "global_positioning":
-        return GlobalPositioning(
-            options.rays_per_camera, options.positioning_loss_scale, options.positioning_start
-        )
-    return ScaleChain(
-        options.rays_per_camera, float(np.radians(options.ray_sigma_deg)), options.max_relative_sigma
-    )
+        start = chain if options.positioning_start == "chain" else None
+        return GlobalPositioning(options.rays_per_camera, options.positioning_loss_scale, start)
+    return chain
 
 
 def _median(values: Array) -> float:

@@ -57,7 +57,7 @@ def _describe_pictures(job: StageJob, options: "DescribeImagesOptions") -> tuple
     descriptor = DESCRIPTORS[options.method](state=job.read_weights(options.method))
     side = descriptor.usual_side_px if options.longer_side_px == "auto" else options.longer_side_px
     described = np.zeros((len(image_ids), descriptor.size), np.float32)
-    images = IndexedImages(index, Path(job.settings["images"]))
+    images = IndexedImages(index.names, index.sha256, Path(job.settings["images"]))
     progress = job.progress(len(image_ids), "images")
     for rows in in_batches([tuple(size) for size in index.sizes[image_ids].tolist()], job.network_batch()):
         pictures = {}
@@ -71,5 +71,9 @@ def _describe_pictures(job: StageJob, options: "DescribeImagesOptions") -> tuple
                 pictures[row] = pixels.rgb
         described[list(pictures)] = describe_batch(descriptor, list(pictures.values()), side)
         progress.step(len(rows))
-    images.warn_of_damaged(job)
+    if images.damaged:
+        job.warn(
+            f"{len(images.damaged)} of {len(image_ids)} images cannot be read and so resemble no other: "
+            f"{next(iter(images.damaged.values()))}"
+        )
     return image_ids.astype(np.int32), described

@@ -28,13 +28,8 @@ def run(job: StageJob) -> None:
         from snakesfm.evaluation.colmap_model import model_poses, read_model
 
         options: EvaluateModelOptions = job.options
-        evaluation = evaluate_poses(
-            poses,
-            model_poses(read_model(Path(reference).expanduser())),
-            options.relative_thresholds_deg,
-            options.global_thresholds_deg,
-            options.min_baseline_ratio,
-        )
+        known = model_poses(read_model(Path(reference).expanduser()))
+        evaluation = evaluate_poses(poses, known, **options.model_dump())
         row |= evaluation.metrics
         content = {**row, "reference": reference, "per_image": evaluation.per_image()}
     for path in job.outputs:

@@ -103,7 +103,6 @@ def _write_geometries(
             pair = (cameras[camera_ids[i]], cameras[camera_ids[j]])
             geometry = panoramic_geometry(tile.rotations[row], inliers, pair)
         else:
-            angle_deg = float(tile.triangulation_angles_deg[row])
-            geometry = calibrated_geometry(tile.rotations[row], tile.translations[row], inliers, angle_deg)
+            geometry = calibrated_geometry(tile.rotations[row], tile.translations[row], inliers)
         database.write_two_view_geometry(i + 1, j + 1, geometry)
     return len(accepted)

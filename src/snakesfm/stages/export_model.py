@@ -10,12 +10,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from snakesfm.artifacts import CalibratedCameras, ImageIndex, Reconstruction, temporary_folder
-from snakesfm.export.colmap import (
-    build_reconstruction,
-    other_model_sizes,
-    registered_images,
-    summarize,
-)
+from snakesfm.artifacts.gather import gather_image_columns
+from snakesfm.export.colmap import build_reconstruction, other_model_sizes, summarize
 from snakesfm.export.georeference import LEAST_IMAGES, Georeference, georeference
 from snakesfm.export.image_folder import place_images
 from snakesfm.export.nerfstudio import camera_warnings, transforms
@@ -23,7 +19,7 @@ from snakesfm.export.undistorted import undistorted_share, write_undistorted
 from snakesfm.geometry.camera import Camera, cameras_from_columns
 from snakesfm.geometry.earth import local_origin
 from snakesfm.geometry.lens_fit import MAX_MISFIT, fit_lenses
-from snakesfm.geometry.poses import center_of, to_camera, translation_of
+from snakesfm.geometry.poses import center_of, has_pose, to_camera, translation_of
 from snakesfm.ingest.masks import masks_as_large
 from snakesfm.stages.job import StageJob
 
@@ -107,7 +103,7 @@ def run(job: StageJob) -> None:
     model, place = _placed(job, index, adjusted.select_model(0))
     cameras = cameras_from_columns(model.camera_models, model.camera_sizes, model.camera_params)
     names = [str(name) for name in index.names]
-    registered = registered_images(model.rotations, model.translations)
+    registered = np.flatnonzero(has_pose(model.rotations, model.translations))
     warnings = _warnings(job, index, adjusted, model, place, cameras)
     given_masks = Path(job.settings["masks"]) if "masks" in job.settings else None
     of_image = {names[row]: cameras[index.camera_ids[row]] for row in registered}
@@ -115,10 +111,11 @@ def run(job: StageJob) -> None:
     for line in warnings:
         sys.stderr.write(f"warning: {line}\n")
     folder = _export_folder(job)
+    keypoints = _all_keypoints(job, index)
     with temporary_folder(folder) as temporary:
         for number in range(max(1, adjusted.model_count)):
             selected = _placed(job, index, adjusted.select_model(number))[0] if number else model
-            _write_colmap(temporary, number, _build(names, index, cameras, selected))
+            _write_colmap(temporary, number, _build(names, index, cameras, selected, keypoints))
         content = transforms(
             names, index.camera_ids, cameras, model.rotations, model.translations, registered, masks
         )
@@ -146,7 +143,7 @@ def _warnings(
     cameras: list[Camera],
 ) -> list[str]:
     """What a user should know of the model, a sentence each."""
-    registered = registered_images(model.rotations, model.translations)
+    registered = np.flatnonzero(has_pose(model.rotations, model.translations))
     used = {row: cameras[row] for row in sorted({int(index.camera_ids[row]) for row in registered})}
     warnings = _camera_warnings(adjusted, used)
     warnings += _lens_warnings(model, cameras, index.camera_ids)
@@ -252,8 +249,19 @@ def _placed(
     return replace(model, rotations=rotations, translations=translations, points=points), place
 
 
+def _all_keypoints(job: StageJob, index: ImageIndex) -> list[np.ndarray] | None:
+    """Per image its keypoints (K_i,2) in original pixels where all are wanted in the model, else None."""
+    if not job.options.all_keypoints:
+        return None
+    return gather_image_columns(job.paths("features"), len(index.names), "keypoints")[0]
+
+
 def _build(
-    names: list[str], index: ImageIndex, cameras: list[Camera], model: Reconstruction
+    names: list[str],
+    index: ImageIndex,
+    cameras: list[Camera],
+    model: Reconstruction,
+    keypoints: list[np.ndarray] | None,
 ) -> "pycolmap.Reconstruction":
     return build_reconstruction(
         names,
@@ -267,6 +275,7 @@ def _build(
         model.offsets,
         model.image_ids,
         model.keypoints,
+        None if keypoints is None else (model.keypoint_ids, keypoints),
     )
 
 

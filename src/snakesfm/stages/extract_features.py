@@ -61,7 +61,7 @@ def run(job: StageJob) -> None:
     options: ExtractFeaturesOptions = job.options
     index = ImageIndex.read(job.path("index"))
     rows = np.flatnonzero(index.blocks == int(job.settings["block"]))
-    pictures = IndexedImages(index, Path(job.settings["images"]))
+    pictures = IndexedImages(index.names, index.sha256, Path(job.settings["images"]))
     finder = _create_finder(job, options)
     beside = job.weights_digest() + str(job.settings.get("source_content", ""))
     names = [str(name) for name in index.names[rows]]
@@ -90,9 +90,14 @@ def run(job: StageJob) -> None:
         progress.step(len(places))
     ordered = [results[place] for place in range(len(rows))]
     _collect(index, rows, digests, ordered, finder).write(job.output, told.header)
-    pictures.warn_of_damaged(job)
     counts = [len(result.points) for result in ordered]
     reused = sum(digest in former for digest in digests)
+    bare = [name for name, count in zip(names, counts, strict=True) if count == 0]
+    if bare:
+        job.warn(
+            f"{len(bare)} of {len(rows)} images have no keypoints and cannot be registered, such as "
+            f"'{bare[0]}': the job's log says whether they could be read."
+        )
     masked = f", {len(masks)} of them with masks" if masks else ""
     print(
         f"{len(rows)} images ({reused} taken over){masked}, {sum(counts)} keypoints, "

@@ -65,6 +65,7 @@ class StageJob:
     threads : how many threads may be used; results never depend on it.
     former : an earlier version of the output whose unchanged parts may be taken over, or None.
     batch_size : how many images or pairs a network gets at once; results never depend on it.
+    terminal : where progress and warnings are said beside the log, or None.
     """
 
     stage: str
@@ -77,6 +78,7 @@ class StageJob:
     threads: int = 1
     former: Path | None = None
     batch_size: int | Literal["auto"] = "auto"
+    terminal: TextIO | None = None
 
     @property
     def output(self) -> Path:
@@ -172,28 +174,30 @@ class StageJob:
         return taken
 
     def warn(self, sentence: str) -> None:
-        """Say a warning in the log and on the terminal, where a stage's result has no place for it."""
+        """Say a warning in the log and on the terminal, where a stage's result has no place for it.
+
+        A job of a block or tile says one sentence of all its images: there may be hundreds of such jobs.
+        """
         sys.stderr.write(f"warning: {sentence}\n")
-        if Progress.terminal is not None:
-            print(
-                f"snakesfm: scene '{self.scene}': warning: {sentence}", file=Progress.terminal, flush=True
-            )
+        if self.terminal is not None:
+            print(f"snakesfm: scene '{self.scene}': warning: {sentence}", file=self.terminal, flush=True)
 
     def progress(self, total: int, what: str) -> "Progress":
         """A counter that prints how far the job is, at most every five seconds."""
-        return Progress(f"{self.scene}: {self.stage} {self.output.stem}", total, what)
+        label = f"{self.scene}: {self.stage} {self.output.stem}"
+        return Progress(label, total, what, self.terminal)
 
 
 class Progress:
     """Counts work that is done and says so, in the log and on the terminal."""
 
     interval_s = 5.0
-    terminal: TextIO | None = None
 
-    def __init__(self, label: str, total: int, what: str) -> None:
+    def __init__(self, label: str, total: int, what: str, terminal: TextIO | None = None) -> None:
         self.label = label
         self.total = total
         self.what = what
+        self.terminal = terminal
         self.done = 0
         self.last = time.monotonic()
 

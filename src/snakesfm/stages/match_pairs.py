@@ -81,8 +81,9 @@ def run(job: StageJob) -> None:
                 prepared.append((first, read_second(j)))
             results |= zip(rows, _match(matcher, prepared), strict=True)
             progress.step(len(rows))
-    if isinstance(source, ImageFiles):
-        source.images.warn_of_damaged(job)
+    if isinstance(source, ImageFiles) and source.images.damaged:
+        damaged = list(source.images.damaged.values())
+        job.warn(f"{len(damaged)} images cannot be read and so match no other: {damaged[0]}")
     matches = [results[row] for row in range(len(pairs))]
     _collect(kind, pairs, digests, matches).write(job.output, job.header)
     counts = [len(rows) for rows, _ in matches]
@@ -205,7 +206,7 @@ class ImageFiles:
         from snakesfm.ingest.indexed import IndexedImages
 
         index = ImageIndex.read(job.paths("index")[0])
-        self.images = IndexedImages(index, Path(job.settings["images"]))
+        self.images = IndexedImages(index.names, index.sha256, Path(job.settings["images"]))
         self._names = [str(name) for name in index.names]
         self.digests = [str(digest) for digest in index.sha256]
         if job.options.method == "virtual_places":

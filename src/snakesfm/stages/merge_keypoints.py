@@ -13,15 +13,13 @@ from snakesfm.artifacts.images import ImageIndex
 from snakesfm.artifacts.pairs import PairCoordinates
 from snakesfm.features.extraction import sample_colors
 from snakesfm.geometry.detector_pixels import detector_scales, reduce_keypoints
+from snakesfm.geometry.detector_sides import USUAL_SIDE_PX
 from snakesfm.ingest.indexed import IndexedImages
 from snakesfm.matching.merging import merge_coordinates
 from snakesfm.stages.job import StageJob
 
 if TYPE_CHECKING:
     from snakesfm.config.merge_keypoints import MergeKeypointsOptions
-
-# colours need no more pixels than this
-COLOR_SIDE_PX = 760
 
 
 def run(job: StageJob) -> None:
@@ -37,7 +35,7 @@ def run(job: StageJob) -> None:
     index = ImageIndex.read(job.path("index"))
     rows = np.flatnonzero(index.blocks == int(job.settings["block"]))
     found = _gather(job.paths("matches"), set(rows.tolist()))
-    images = IndexedImages(index, Path(job.settings["images"]))
+    images = IndexedImages(index.names, index.sha256, Path(job.settings["images"]))
     progress = job.progress(len(rows), "images")
     # an empty set in front keeps shapes and dtypes where the block has no image
     keypoints, scores = [np.zeros((0, 2), np.float32)], [np.zeros(0, np.float32)]
@@ -91,7 +89,8 @@ def _read_colors(images: IndexedImages, row: int, keypoints: Array) -> Array:
     """RGB of an image of the index at the keypoints; black where it cannot be decoded."""
     if len(keypoints) == 0:
         return np.zeros((0, 3), np.uint8)
-    image = images.read(row, COLOR_SIDE_PX)
+    # colours need no more pixels
+    image = images.read(row, USUAL_SIDE_PX)
     if image is None:
         return np.zeros((len(keypoints), 3), np.uint8)
     return sample_colors(image.rgb, keypoints / image.reduction)

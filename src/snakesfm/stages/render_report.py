@@ -12,6 +12,7 @@ import numpy as np
 import snakesfm
 from snakesfm.arrays import Array
 from snakesfm.artifacts import (
+    CalibratedCameras,
     CameraRotations,
     ImageIndex,
     Reconstruction,
@@ -54,6 +55,7 @@ class Pairs:
 def run(job: StageJob) -> None:
     """Write index.html."""
     index = ImageIndex.read(job.path("index"))
+    calibrated = CalibratedCameras.read(job.path("cameras"))
     adjusted = Reconstruction.read(job.path("reconstruction"))
     model = adjusted.select_model(0)
     graph = ViewGraph.read(job.path("graph"))
@@ -89,7 +91,9 @@ def run(job: StageJob) -> None:
         warnings=summary.get("warnings", []),
         maps=_maps(names, model, registered),
         stage_heads=["stage", "result", *(["seconds", "peak MB"] if seconds else [])],
-        stages=_stage_rows(index, pairs, graph, rotations, tracks, points, model, counts, seconds),
+        stages=_stage_rows(
+            index, calibrated, pairs, graph, rotations, tracks, points, model, counts, seconds
+        ),
         tables=_tables(pairs, graph, model, metrics),
         histogram=error_histogram(errors),
         histogram_caption=f"Errors of {len(errors):,} observations; the last bar includes the largest 1 %.",
@@ -187,6 +191,7 @@ def _maps(names: Sequence[str], model: Reconstruction, registered: Array) -> lis
 
 def _stage_rows(
     index: ImageIndex,
+    calibrated: CalibratedCameras,
     pairs: Pairs,
     graph: ViewGraph,
     rotations: CameraRotations,
@@ -206,6 +211,7 @@ def _stage_rows(
     results = {
         "index_images": f"{len(index.names):,} images of {len(index.camera_models):,} cameras; "
         f"{len(index.refused_names):,} files refused, {duplicates:,} duplicates",
+        "calibrate_cameras": _describe_focals(calibrated),
         "match_pairs": f"{len(pairs.pairs):,} pairs matched, {int(pairs.match_counts.sum()):,} matches "
         "between distinct places",
         "estimate_two_view": f"{int(accepted.sum()):,} pairs accepted ({kind_text or 'none'}), "
@@ -227,6 +233,13 @@ def _stage_rows(
     stages = [stage for stage in seconds if stage not in results]
     rows = [[stage, text] for stage, text in results.items()] + [[stage, ""] for stage in stages]
     return [[*row, *seconds.get(row[0], (None, None))] for row in rows] if seconds else rows
+
+
+def _describe_focals(cameras: CalibratedCameras) -> str:
+    sources = Counter(cameras.sources.tolist())
+    text = "focal lengths: " + ", ".join(f"{sources[source]:,} {source}" for source in sorted(sources))
+    known = cameras.focal_sigma[np.isfinite(cameras.focal_sigma)]
+    return text + (f"; median standard deviation {100 * np.median(known):.1f} %" if len(known) else "")
 
 
 def _missing(

@@ -109,9 +109,9 @@ def read_previews(paths: list[Path], images: int, count: int) -> list[Array]:
 def _choose(job: StageJob, index: ImageIndex, options: "SelectPairsOptions", pairs_file: str) -> PairTable:
     names = [str(name) for name in index.names]
     if options.method == "listed":
-        refused = [str(name) for name in index.refused_names]
-        matched = is_matches_file(pairs_file)
-        return _matched_pairs(pairs_file, names) if matched else _read_list(pairs_file, names, refused)
+        if is_matches_file(pairs_file):
+            return _matched_pairs(job, pairs_file, names)
+        return _read_list(job, pairs_file, names, [str(name) for name in index.refused_names])
     if options.method == "exhaustive":
         return exhaustive_pairs(len(names))
     table = PairTable.of(np.zeros((0, 2)), "sequential")
@@ -120,7 +120,7 @@ def _choose(job: StageJob, index: ImageIndex, options: "SelectPairsOptions", pai
     if "spatial" in options.method:
         places = _local_places(index)
         table = table.union(spatial_pairs(places, int(options.top_k)))
-        unplaced = np.isnan(places).any(axis=1)
+        unplaced = ~np.isfinite(places[:, 0])
         if unplaced.any():
             job.warn(
                 f"{unplaced.sum()} of {len(names)} images have no GPS position in EXIF: they are paired "
@@ -150,7 +150,7 @@ def _local_places(index: ImageIndex) -> Array:
     return local_metres(places, origin)[:, :2]
 
 
-def _read_list(path: str, names: list[str], refused: list[str]) -> PairTable:
+def _read_list(job: StageJob, path: str, names: list[str], refused: list[str]) -> PairTable:
     if not path:
         raise ConfigError("select_pairs.method is 'listed' but no list is given: use --config pairs=FILE.")
     try:
@@ -161,11 +161,14 @@ def _read_list(path: str, names: list[str], refused: list[str]) -> PairTable:
         ) from None
     table, skipped = listed_pairs(lines, names, refused, path)
     if skipped:
-        print(f"warning: {skipped} listed pairs are left out: they name an image that cannot be used")
+        job.warn(
+            f"{skipped} pairs of '{path}' are left out: they name an image that cannot be used, as the "
+            "report says."
+        )
     return table
 
 
-def _matched_pairs(path: str, names: list[str]) -> PairTable:
+def _matched_pairs(job: StageJob, path: str, names: list[str]) -> PairTable:
     """The pairs of images that hloc's file of matches holds."""
     with open_hloc(Path(path).expanduser()) as file:
         pairs, others = read_hloc_pairs(file, names)
@@ -175,7 +178,7 @@ def _matched_pairs(path: str, names: list[str]) -> PairTable:
             "image names must be relative to the image folder."
         )
     if others:
-        print(f"warning: {others} pairs of '{path}' are left out: they name an image that is not used")
+        job.warn(f"{others} pairs of '{path}' are left out: they name an image that is not used.")
     return PairTable.of(pairs, "listed")
 
 

@@ -38,8 +38,8 @@ def refine_angles(
     problem: PositioningProblem,
     centers: Array,
     scale_rad: float,
+    edge_weight: float,
     rounds: int = 20,
-    edge_weight: float = 0.1,
 ) -> tuple[Array, Array]:
     """Centres (N,3) and landmarks (max track + 1, 3) that fit the rays and edges best, from a first guess.
 

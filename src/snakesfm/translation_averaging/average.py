@@ -1,7 +1,6 @@
 """From directions to checked centres: first guess, refinement, weak cameras, gauge, residuals."""
 
-from dataclasses import dataclass
-from functools import partial
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -23,6 +22,32 @@ MOST_RAYS = 500_000
 
 
 @dataclass(frozen=True)
+class PositioningSettings:
+    """How cameras are positioned.
+
+    Parameters
+    ----------
+    averager : gives the first positions.
+    limits : what holds a camera in place.
+    refine : whether the first positions are refined by the angles of rays and edges.
+    rays_per_camera : about how many take part in all but the first positions.
+    edge_weight : of an edge relative to a ray in the refinement.
+    restarts : random starts that are tried where few rays agree with the positions.
+    restart : what starts, with more rays.
+    seed : of what is drawn.
+    """
+
+    averager: TranslationAverager
+    limits: SupportLimits
+    refine: bool
+    rays_per_camera: int
+    edge_weight: float
+    restarts: int
+    restart: GlobalPositioning
+    seed: int
+
+
+@dataclass(frozen=True)
 class AveragedCenters:
     """Centres of N cameras, and how well E edges and Q rays agree with them."""
 
@@ -30,23 +55,12 @@ class AveragedCenters:
     """(N,3), NaN where there is none; the median edge is one unit long and the median centre the origin."""
     edge_residuals_rad: Array
     """(E) NaN where a centre is missing."""
-    ray_tracks: Array
-    """(Q) track of each ray that took part."""
     ray_residuals_rad: Array
-    """(Q)."""
+    """(Q) of the rays that took part."""
 
 
-def average_components(
-    problem: PositioningProblem,
-    components: Array,
-    averager: TranslationAverager,
-    limits: SupportLimits,
-    *,
-    refine: bool = True,
-    rays_per_camera: int = 100,
-    edge_weight: float = 0.1,
-    restarts: int = 0,
-    seed: int = 0,
+def position_components(
+    problem: PositioningProblem, components: Array, settings: PositioningSettings
 ) -> AveragedCenters:
     """Position the cameras of each component (N,) of the images, -1 for none, in its own frame."""
     centers = np.full((problem.image_count, 3), np.nan)
@@ -55,45 +69,27 @@ def average_components(
     for component in range(max(1, int(components.max(initial=-1)) + 1)):
         mine = components == component
         edges = mine[problem.pairs].all(axis=1)
-        found = average_translations(
-            problem.select_edges(edges).select_rays(mine[problem.ray_images]),
-            averager,
-            limits,
-            refine=refine,
-            rays_per_camera=rays_per_camera,
-            edge_weight=edge_weight,
-            restarts=restarts,
-            seed=seed,
-        )
+        part = problem.select_edges(edges).select_rays(mine[problem.ray_images])
+        found = average_translations(part, settings)
         centers[mine] = found.centers[mine]
         edge_residuals[edges] = found.edge_residuals_rad
-        rays.append((found.ray_tracks, found.ray_residuals_rad))
-    tracks, residuals = (np.concatenate(column) for column in zip(*rays, strict=True))
-    return AveragedCenters(centers, edge_residuals, tracks, residuals)
+        rays.append(found.ray_residuals_rad)
+    return AveragedCenters(centers, edge_residuals, np.concatenate(rays))
 
 
-def average_translations(
-    problem: PositioningProblem,
-    averager: TranslationAverager,
-    limits: SupportLimits,
-    *,
-    refine: bool = True,
-    rays_per_camera: int = 100,
-    edge_weight: float = 0.1,
-    restarts: int = 0,
-    seed: int = 0,
-) -> AveragedCenters:
+def average_translations(problem: PositioningProblem, settings: PositioningSettings) -> AveragedCenters:
     """Position the cameras of the largest connected part.
 
     A camera that its rays and edges do not hold in place is positioned again from the others, and gets no
     centre if that does not hold either: weakly seen cameras are otherwise thrown far away.
 
-    Where few rays agree with the positions, as of facades that repeat, ``restarts`` random starts of global
-    positioning with more rays are tried, and the positions are kept with which most of all rays agree.
+    Where few rays agree with the positions, as of facades that repeat, random starts of global positioning
+    with more rays are tried, and the positions are kept with which most of all rays agree.
     """
+    limits = settings.limits
     part = largest_part(problem)
     # what is worked out per track must cost as much as there are rays, not as the highest number tells
-    chosen, tracks = with_rays(part, rays_per_camera).number_tracks()
+    chosen = with_rays(part, settings.rays_per_camera).number_tracks()[0]
     images = part.images()
     if len(images) < 2:
         centers = np.full((problem.image_count, 3), np.nan)
@@ -102,26 +98,26 @@ def average_translations(
         centers[part.pairs[0, 0]] = 0.0
         centers[part.pairs[0, 1]] = part.directions[0]
     else:
-        check = partial(_checked_positions, limits=limits, refine=refine, edge_weight=edge_weight)
-        centers = check(chosen, averager.position(part, seed))
-        if restarts and agreeing_share(chosen, centers, limits) < DOUBTFUL_SHARE:
+        first = settings.averager.position(part, settings.seed)
+        centers = _checked_positions(chosen, first, settings)
+        if settings.restarts and agreeing_share(chosen, centers, limits) < DOUBTFUL_SHARE:
             # look-alikes make wrong edges and the longest tracks: more rays, without edges, may agree
-            many = max(rays_per_camera, min(MORE_RAYS * rays_per_camera, MOST_RAYS // len(images)))
-            more, more_tracks = with_rays(part, many).number_tracks()
-            whole, _ = part.number_tracks()
+            few = settings.rays_per_camera
+            many = max(few, min(MORE_RAYS * few, MOST_RAYS // len(images)))
+            restart = replace(settings.restart, rays_per_camera=many)
+            more, whole = with_rays(part, many).number_tracks()[0], part.number_tracks()[0]
             best = max(agreeing_share(whole, centers, limits), LEAST_SHARE)
-            for start in range(restarts):
-                other = check(more, GlobalPositioning(many).position(part, seed + start))
+            for start in range(settings.restarts):
+                other = _checked_positions(more, restart.position(part, settings.seed + start), settings)
                 share = agreeing_share(whole, other, limits)
                 if share > best:
-                    chosen, tracks, centers, best = more, more_tracks, other, share
+                    chosen, centers, best = more, other, share
     centers = normalize_gauge(part, centers)
     seen = chosen.select_rays(np.isfinite(centers[chosen.ray_images, 0]))
     points = _landmarks(seen, centers)
     return AveragedCenters(
         centers=centers,
         edge_residuals_rad=edge_angles_rad(problem, centers),
-        ray_tracks=tracks[seen.ray_tracks],
         ray_residuals_rad=angles_rad(seen, centers, points),
     )
 
@@ -160,17 +156,15 @@ def normalize_gauge(problem: PositioningProblem, centers: Array) -> Array:
     return np.asarray((centers - np.median(centers[known], axis=0)) / scale)
 
 
-def _checked_positions(
-    problem: PositioningProblem, centers: Array, limits: SupportLimits, refine: bool, edge_weight: float
-) -> Array:
+def _checked_positions(problem: PositioningProblem, centers: Array, settings: PositioningSettings) -> Array:
     """First positions (N,3) refined, without the cameras that nothing holds in place."""
-    if refine:
-        centers = _refined(problem, centers, limits, edge_weight)
-    checked = _checked(problem, centers, limits)
+    if settings.refine:
+        centers = _refined(problem, centers, settings)
+    checked = _checked(problem, centers, settings.limits)
     # cameras that moved or went away may have bent their neighbourhood
-    if refine and not np.array_equal(checked, centers, equal_nan=True):
-        checked = _refined(problem, checked, limits, edge_weight)
-        checked = _checked(problem, checked, limits, attach=False)
+    if settings.refine and not np.array_equal(checked, centers, equal_nan=True):
+        checked = _refined(problem, checked, settings)
+        checked = _checked(problem, checked, settings.limits, attach=False)
     return checked
 
 
@@ -179,12 +173,9 @@ def _landmarks(problem: PositioningProblem, centers: Array) -> Array:
     return intersect(centers[problem.ray_images], problem.rays, problem.ray_tracks, size)
 
 
-def _refined(
-    problem: PositioningProblem, centers: Array, limits: SupportLimits, edge_weight: float
-) -> Array:
-    return refine_angles(
-        problem, normalize_gauge(problem, centers), limits.sigma_rad, edge_weight=edge_weight
-    )[0]
+def _refined(problem: PositioningProblem, centers: Array, settings: PositioningSettings) -> Array:
+    start = normalize_gauge(problem, centers)
+    return refine_angles(problem, start, settings.limits.sigma_rad, settings.edge_weight)[0]
 
 
 def _checked(

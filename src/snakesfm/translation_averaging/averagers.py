@@ -12,6 +12,7 @@ from snakesfm.translation_averaging.problem import PositioningProblem
 from snakesfm.translation_averaging.scale_chain import chain_centers
 from snakesfm.view_graph.components import label_components
 
+HUBER_SIGMAS = 1.345
 LARGEST_SCALE_GAP = 10.0
 LEAST_SHARE_AT_ONE_SCALE = 0.9
 
@@ -30,18 +31,19 @@ class TranslationAverager(Protocol):
 class ScaleChain:
     """Baselines compared through shared landmarks, then linear; see :mod:`scale_chain`.
 
-    Draws nothing at random. Where too few landmarks are shared to link most cameras,
-    :class:`TranslationRecovery` is used instead.
+    Draws nothing at random. Where too few landmarks are shared to link most cameras, ``fallback`` is used
+    instead.
     """
 
-    rays_per_camera: int = 100
-    sigma_rad: float = math.radians(0.3)
-    max_relative_sigma: float = 0.1
+    rays_per_camera: int
+    sigma_rad: float
+    max_relative_sigma: float
+    fallback: TranslationAverager
 
     def position(self, problem: PositioningProblem, seed: int) -> Array:
         """See :class:`TranslationAverager`."""
         centers = self.link(problem)
-        return TranslationRecovery().position(problem, seed) if centers is None else centers
+        return self.fallback.position(problem, seed) if centers is None else centers
 
     def link(self, problem: PositioningProblem) -> Array | None:
         """Centres (N,3), or None where the landmarks link fewer than half of the cameras."""
@@ -56,16 +58,16 @@ class TranslationRecovery:
 
     With the outlier rejection of 1DSfM (Wilson and Snavely, ECCV 2014; ``mfas``), or by the residuals of a
     first solution (``residual``). It starts at random places. Directions alone may agree with parts of the
-    scene at scales of their own; where landmarks say otherwise, :class:`ScaleChain` is used instead.
+    scene at scales of their own; where landmarks say otherwise, ``chain`` is used instead, if there is one.
     """
 
-    rays_per_camera: int = 12
-    sigma: float = 0.01
-    huber: float = 1.345
-    reject_outliers: Literal["mfas", "residual", "none"] = "residual"
-    residual_rad: float = math.radians(5.0)
-    mfas_projections: int = 100
-    mfas_weight: float = 0.125
+    rays_per_camera: int
+    sigma: float
+    reject_outliers: Literal["mfas", "residual", "none"]
+    residual_rad: float
+    mfas_projections: int
+    mfas_weight: float
+    chain: ScaleChain | None
 
     def position(self, problem: PositioningProblem, seed: int) -> Array:
         """See :class:`TranslationAverager`."""
@@ -75,12 +77,12 @@ class TranslationRecovery:
         if self.reject_outliers == "mfas" and len(problem.pairs):
             keep = mfas_weights(problem, self.mfas_projections, seed) < self.mfas_weight
             problem = problem.select_edges(keep)
-        centers = recover_translations(problem, self.sigma, self.huber, seed)
+        centers = recover_translations(problem, self.sigma, HUBER_SIGMAS, seed)
         if self.reject_outliers == "residual":
             keep = ~(edge_angles_rad(problem, centers) > self.residual_rad)
             if not keep.all():
-                centers = recover_translations(problem.select_edges(keep), self.sigma, self.huber, seed)
-        chained = ScaleChain().link(whole)
+                centers = recover_translations(problem.select_edges(keep), self.sigma, HUBER_SIGMAS, seed)
+        chained = self.chain.link(whole) if self.chain else None
         if chained is None:
             return centers
         share = share_at_one_scale(whole.pairs, centers, chained)
@@ -97,18 +99,18 @@ class TranslationRecovery:
 class GlobalPositioning:
     """pycolmap's global positioning (Pan et al., "Global Structure-from-Motion Revisited", ECCV 2024).
 
-    ``start`` is ``random``, as in GLOMAP, or ``chain``: the centres of :class:`ScaleChain`.
+    It starts at the centres of ``start``, or at random ones if None, as in GLOMAP.
     """
 
-    rays_per_camera: int = 100
-    loss_scale: float = 0.01
-    start: Literal["random", "chain"] = "random"
+    rays_per_camera: int
+    loss_scale: float
+    start: ScaleChain | None
 
     def position(self, problem: PositioningProblem, seed: int) -> Array:
         """See :class:`TranslationAverager`."""
         from snakesfm.translation_averaging.positioning import position_globally
 
-        start = ScaleChain().position(problem, seed) if self.start == "chain" else None
+        start = self.start.position(problem, seed) if self.start else None
         return position_globally(with_rays(problem, self.rays_per_camera), start, self.loss_scale, seed)
 
 

@@ -22,7 +22,7 @@ AGREEING_SIGMAS = 4.0
 LARGEST_CONDITION = 1e14
 
 
-def join_clusters(
+def join_by_edges(
     problem: PositioningProblem, clusters: Sequence[Array], max_relative_sigma: float
 ) -> Array:
     """Centres (N,3) of the first cluster and of all that shared cameras and edges tie to it.

@@ -12,7 +12,7 @@ import numpy as np
 from snakesfm.arrays import Array
 from snakesfm.geometry.sparse_systems import solve_spd
 from snakesfm.grouping import components_of, offsets_of, sum_by
-from snakesfm.translation_averaging.clusters import join_clusters
+from snakesfm.translation_averaging.clusters import join_by_edges
 from snakesfm.translation_averaging.problem import PositioningProblem
 
 FIRST_SCALE = 16.0
@@ -103,7 +103,7 @@ def epipolar_rad(
 def chain_centers(
     problem: PositioningProblem,
     scale_rad: float,
-    max_relative_sigma: float = 0.1,
+    max_relative_sigma: float,
     edges_per_camera: int = 8,
 ) -> Array:
     """Centres (N,3) from the baselines of the edges; NaN where an image hangs on no edge that has one.
@@ -114,7 +114,7 @@ def chain_centers(
     ----------
     problem : with rays.
     scale_rad : angle at which a ray is held to be half wrong.
-    max_relative_sigma : of the centres of a part that edges join, see :func:`join_clusters`.
+    max_relative_sigma : of the centres of a part that edges join, see :func:`join_by_edges`.
     edges_per_camera : the best edges of each camera, by parallax of the rays that agree, take part.
     """
     edges, left, right = shared_rays(problem)
@@ -147,7 +147,7 @@ def chain_centers(
         found.append(_link(problem, directions, np.exp(baselines), firmness, linked))
     if not found:
         return np.full((problem.image_count, 3), np.nan)
-    return join_clusters(replace(problem, directions=directions), found, max_relative_sigma)
+    return join_by_edges(replace(problem, directions=directions), found, max_relative_sigma)
 
 
 def _comparable_parts(edges: Array, rows: Array, edge_count: int, row_count: int) -> list[Array]:

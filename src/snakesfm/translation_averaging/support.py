@@ -1,6 +1,5 @@
 """Test of which camera centres the measurements determine, and how well."""
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -35,11 +34,11 @@ class SupportLimits:
         median length of the rays that count.
     """
 
-    sigma_rad: float = math.radians(0.3)
-    edge_rad: float = math.radians(5.0)
-    min_support: int = 6
-    min_ratio: float = 0.5
-    max_relative_sigma: float = 0.1
+    sigma_rad: float
+    edge_rad: float
+    min_support: int
+    min_ratio: float
+    max_relative_sigma: float
 
     @property
     def ray_rad(self) -> float:

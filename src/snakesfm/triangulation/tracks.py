@@ -7,6 +7,7 @@ import numpy as np
 
 from snakesfm.arrays import Array
 from snakesfm.geometry.camera import Camera, undistort
+from snakesfm.geometry.poses import has_pose
 from snakesfm.grouping import offsets_of
 from snakesfm.triangulation.interface import TriangulationLimits, TriangulationProblem, Triangulator
 
@@ -55,8 +56,7 @@ def triangulate_tracks(
     points (T,3) in the world, NaN where there is none; and (L,) bool, the observations of the points.
     """
     rays = undistort(cameras, camera_ids, image_ids, keypoints)
-    posed = np.isfinite(rotations[:, 0, 0]) & np.isfinite(translations[:, 0])
-    usable = posed[image_ids] & np.isfinite(rays).all(axis=1)
+    usable = has_pose(rotations, translations)[image_ids] & np.isfinite(rays).all(axis=1)
     track_of = np.repeat(np.arange(len(offsets) - 1), np.diff(offsets))
     lengths = np.bincount(track_of[usable], minlength=len(offsets) - 1)
     focals = np.array([camera.focal_px for camera in cameras])[camera_ids]

@@ -112,6 +112,25 @@ def test_unknown_cameras_are_shared_as_in_the_reference(tmp_path: Path) -> None:
     ]
 
 
+@pytest.mark.parametrize(
+    ("model", "is_pinhole"),
+    [("PINHOLE 64 48 50 51 32 24", True), ("SIMPLE_RADIAL 64 48 50 32 24 0.1", False)],
+)
+def test_a_matrix_is_told_of_a_camera_without_distortion(
+    tmp_path: Path, model: str, is_pinhole: bool
+) -> None:
+    for folder in ("images", "reference"):
+        (tmp_path / "set" / folder).mkdir(parents=True)
+    for part in ("images", "points3D"):
+        (tmp_path / "set" / "reference" / f"{part}.txt").write_text("")
+    (tmp_path / "set" / "reference" / "cameras.txt").write_text(f"1 {model}\n")
+    matrix = [[50, 0, 32], [0, 51, 24], [0, 0, 1]]
+    assert ImageSet(tmp_path / "set", True, True).pinhole() == (matrix if is_pinhole else None)
+    # a reference is COLMAP's where nothing else is said
+    (found,) = read_sets(tmp_path, ["set"])
+    assert (found.known, found.truth) == (False, False)
+
+
 def test_a_folder_that_is_no_set_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"lacking is not an image set: it needs images/ and reference/"):
         read_sets(tmp_path, ["lacking"])

@@ -11,6 +11,7 @@ from benchmarks.compare.ablate import DEFAULT, read_ablations, render_ablations
 from benchmarks.compare.measure import Cost
 from benchmarks.compare.methods import stage_costs
 from benchmarks.compare.results import GLOBAL, INCREMENTAL, OURS, OWN, SAME, Result, read_results
+from benchmarks.compare.run import Campaign
 from benchmarks.compare.summary import COLUMNS, best_peer, gap, group, ratios, speed, spread, tally
 from benchmarks.compare.tables import render_csv, render_page
 from snakesfm.errors import ConfigError
@@ -75,6 +76,20 @@ def test_disturbed_timings_count_only_where_there_are_no_others() -> None:
     louder = result(OURS, 2, 90.0, 12.0, others=0.5)
     assert spread(seconds, [loud, louder]).median == 18.0
     assert spread(column(AREA), [calm, loud]).least == 90.0
+    groups = group([calm, result(INCREMENTAL, 0, 80.0, 16.0, others=0.5)])
+    assert speed("total_seconds", groups, "castle", OWN, INCREMENTAL) is None
+    assert speed("total_cpu_seconds", groups, "castle", OWN, INCREMENTAL) == (8.0, True)
+
+
+def test_what_was_disturbed_is_measured_again_where_that_is_asked_for(tmp_path: Path) -> None:
+    calm, loud = result(OURS, 0, 90.0, 2.0), result(INCREMENTAL, 0, 90.0, 9.0, others=0.5)
+    other = result(INCREMENTAL, 1, 90.0, 9.0, others=0.5)
+    for retime, taken in ((False, [True, True, True]), (True, [True, False, True])):
+        campaign = Campaign(tmp_path, 2, 1, 1, 60.0, (OURS,), retime)
+        assert not campaign.takes_over(replace(calm, seed=5))
+        for item in (calm, loud, other):
+            item.write(campaign.results)
+        assert [campaign.takes_over(item) for item in (calm, loud, other)] == taken
 
 
 def test_tally_calls_small_differences_equal() -> None:
@@ -88,6 +103,7 @@ def test_snakesfm_takes_part_on_the_same_features_with_its_mapping(
         item.write(tmp_path)
     assert results[0].stored(tmp_path) == results[0]
     assert replace(results[0], inputs="other").stored(tmp_path) is None
+    assert replace(results[0], known=False).stored(tmp_path) is None
     read = read_results(tmp_path)
     shared = [item for item in read if item.setting == SAME]
     assert len(read) == len(results) + 3

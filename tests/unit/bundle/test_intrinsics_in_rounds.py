@@ -47,6 +47,13 @@ def test_distortion_is_held_in_the_rounds_before(passes, start, rounds_with):
     assert params[3] != 0.0
 
 
+@pytest.mark.parametrize(("start", "rounds_with"), [(1, [0, 1, 1, 1]), (2, [0, 0, 1, 1])])
+def test_the_pass_with_fixed_rotations_is_none_of_the_rounds_that_are_counted(passes, start, rounds_with):
+    adjusted(distortion_from_round=start, rotations_first=True)
+    assert [settings.constant_rotations for settings in passes[:4]] == [1, 0, 0, 0]
+    assert [settings.refine_distortion for settings in passes[:4]] == rounds_with
+
+
 def test_distortion_stays_held_where_it_is_switched_off(passes):
     assert adjusted(SolverSettings(refine_distortion=False))[3] == 0.0
     assert not any(settings.refine_distortion for settings in passes)

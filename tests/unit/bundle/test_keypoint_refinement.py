@@ -1,5 +1,7 @@
 """Observations aligned in rendered images of a textured plane, whose keypoints are known exactly."""
 
+import functools
+
 import cv2
 import numpy as np
 import pytest
@@ -62,6 +64,29 @@ def scene():
         seen = points @ rotation.T + translation
         pixels.append(400.0 * seen[:, :2] / seen[:, 2:] + np.array([200.0, 150.0]))
     return points, [image.astype(np.uint8) for image in images], poses, np.array(pixels)
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_images_of_a_sequence_are_read_once_however_many_there_are(threads: int) -> None:
+    count, length = 100, 6
+    look = texture(3, 60, 80)
+
+    @functools.lru_cache(maxsize=48)
+    def read_gray(image: int) -> GrayImage:
+        return GrayImage(look, np.ones(2))
+
+    starts = np.repeat(np.arange(count - length), length)
+    images = starts + np.tile(np.arange(length), count - length)
+    pixels = np.tile([40.2, 30.3], (len(images), 1))
+    # the template of a track is its last image for some, its first for others
+    templates = np.repeat(np.arange(count - length) * length + np.arange(count - length) % 2 * 5, length)
+    tangents, inside = np.tile(np.eye(2), (len(images), 1, 1)), np.ones(len(images), bool)
+    moved, aligned = align_observations(
+        read_gray, images, pixels, tangents, templates, inside, AlignmentSettings(threads=threads)
+    )
+    assert aligned.all()
+    np.testing.assert_allclose(moved, pixels, atol=0.01)
+    assert count - 1 <= read_gray.cache_info().misses <= count + 2
 
 
 def model_of(scene, noise_px: float):

@@ -6,6 +6,7 @@ import numpy as np
 import pycolmap
 import pytest
 
+from snakesfm.config.evaluate_model import EvaluateModelOptions
 from snakesfm.errors import ConfigError
 from snakesfm.evaluation.__main__ import main
 from snakesfm.evaluation.alignment import align_poses
@@ -21,6 +22,8 @@ from snakesfm.geometry.poses import center_of, translation_of
 from snakesfm.geometry.rotations import angle_of, exp_so3
 from snakesfm.image_names import match_names
 from snakesfm.synthetic.problems import make_problem
+
+DEFAULTS = EvaluateModelOptions().model_dump()
 
 
 def random_poses(count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
@@ -181,7 +184,7 @@ def test_noisy_alignment_is_about_as_good_as_least_squares() -> None:
 def test_a_model_equal_to_its_reference_scores_everything() -> None:
     rotations, centers = random_poses(12)
     model_rotations, model_centers, _, _ = transformed(rotations, centers)
-    result = evaluate_poses(named(model_rotations, model_centers), named(rotations, centers))
+    result = evaluate_poses(named(model_rotations, model_centers), named(rotations, centers), **DEFAULTS)
     for name, value in result.metrics.items():
         if "auc" in name:
             assert value == pytest.approx(100.0, abs=1e-3), name
@@ -196,7 +199,7 @@ def test_unregistered_images_count_as_failures_and_strangers_are_not_scored() ->
     model.rotations[0] = np.nan
     model.translations[0] = np.nan
     names = [*model.names[:9], "not there.jpg"]
-    result = evaluate_poses(model, named(rotations, centers, names))
+    result = evaluate_poses(model, named(rotations, centers, names), **DEFAULTS)
     assert result.metrics["reference_images"] == 10
     assert result.metrics["reference_images_present"] == 9
     assert result.metrics["reference_images_registered"] == 8
@@ -209,7 +212,7 @@ def test_unregistered_images_count_as_failures_and_strangers_are_not_scored() ->
 def test_a_model_without_any_scored_image_gets_zeros_and_nulls() -> None:
     rotations, centers = random_poses(4)
     model = Poses(["x.jpg"], np.full((1, 3, 3), np.nan), np.full((1, 3), np.nan))
-    metrics = evaluate_poses(model, named(rotations, centers)).metrics
+    metrics = evaluate_poses(model, named(rotations, centers), **DEFAULTS).metrics
     assert metrics["relative_pose_auc_1deg"] == 0.0
     assert metrics["pose_auc_20deg"] == 0.0
     assert metrics["position_error_median"] is None
@@ -222,7 +225,9 @@ def test_known_noise_gives_known_errors() -> None:
     rotations, centers = random_poses(200)
     axes = rng.normal(size=(200, 3))
     axes *= np.radians(1.0) / np.linalg.norm(axes, axis=1, keepdims=True)
-    metrics = evaluate_poses(named(exp_so3(axes) @ rotations, centers), named(rotations, centers)).metrics
+    metrics = evaluate_poses(
+        named(exp_so3(axes) @ rotations, centers), named(rotations, centers), **DEFAULTS
+    ).metrics
     assert 0.9 < metrics["rotation_error_deg_median"] < 1.1
     assert 1.2 < metrics["relative_rotation_error_deg_median"] < 1.6
     assert metrics["position_error_max"] < 0.2
@@ -237,7 +242,7 @@ def test_position_errors_are_percent_of_the_references_extent() -> None:
     rotations, _ = random_poses(4)
     centers = np.array([[0.0, 0, 0], [10.0, 0, 0], [0.0, 2, 0], [10.0, 2, 0]])
     shifted = centers + np.array([[0.0, 0, 0.1], [0, 0, 0], [0, 0, 0], [0, 0, 0]])
-    metrics = evaluate_poses(named(rotations, shifted), named(rotations, centers)).metrics
+    metrics = evaluate_poses(named(rotations, shifted), named(rotations, centers), **DEFAULTS).metrics
     assert 0.5 < metrics["position_error_percent_max"] < 1.1
     assert metrics["position_error_percent_max"] == pytest.approx(
         100.0 * metrics["position_error_max"] / metrics["reference_extent"]
@@ -254,6 +259,9 @@ def test_names_match_by_path_and_else_by_a_unique_file_name() -> None:
         -1,
     ]
     assert match_names(["1.jpg"], ["a/1.jpg", "b/1.jpg"]).tolist() == [-1, -1]
+    # no image is that of two, whichever of its names decides
+    assert match_names(["a/1.jpg"], ["a/1.jpg", "1.jpg", "1.png"]).tolist() == [0, -1, -1]
+    assert match_names(["a/1.jpg"], ["b/1.jpg", "c/1.png"]).tolist() == [0, -1]
     assert match_names(["a/1.jpg"], ["a/1.jpg", "b/1.jpg"]).tolist() == [0, -1]
 
 

@@ -14,6 +14,7 @@ from snakesfm.artifacts import (
     PairMatches,
     TwoViewGeometries,
 )
+from snakesfm.config.evaluate_model import EvaluateModelOptions
 from snakesfm.config.export_database import ExportDatabaseOptions
 from snakesfm.errors import ArtifactError
 from snakesfm.evaluation.colmap_model import model_poses
@@ -246,7 +247,7 @@ def test_global_mapping_takes_the_database_as_it_is(
     model = max(models.values(), key=lambda item: item.num_reg_images())
     assert model.num_reg_images() == COUNT
     truth = Poses(NAMES, problem.rotations, problem.translations)
-    metrics = evaluate_poses(model_poses(model), truth).metrics
+    metrics = evaluate_poses(model_poses(model), truth, **EvaluateModelOptions().model_dump()).metrics
     assert 75.0 < metrics["relative_pose_auc_1deg"] < 99.9
 
 

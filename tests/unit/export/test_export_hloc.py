@@ -9,10 +9,10 @@ from plain_index import write_plain_index
 from snakesfm.artifacts import Header, LocalFeatures, PairMatches, TwoViewGeometries
 from snakesfm.config.export_hloc import ExportHlocOptions
 from snakesfm.stages import export_hloc
-from snakesfm.stages.job import Progress, StageJob
+from snakesfm.stages.job import StageJob
 
 
-def export(folder, names, pairs):
+def export(folder, names, pairs, terminal=None):
     """The stage on images of two keypoints, of which each pair matches the first."""
     count = len(names)
     header = Header("stage", 1, "scene")
@@ -61,18 +61,16 @@ def export(folder, names, pairs):
             inputs={"index": index, "features": features, "matches": matches, "geometries": geometries},
             outputs=tuple(folder / name for name in ("features.h5", "matches.h5", "pairs.txt")),
             options=ExportHlocOptions(matches="putative"),
+            terminal=terminal,
         )
     )
     return (folder / "pairs.txt").read_text("utf-8")
 
 
 @pytest.mark.parametrize("name", ["b 1.jpg", "my photos/b.jpg", "b\u00a01.jpg"])
-def test_names_with_spaces_are_warned_of_in_the_log_and_on_the_terminal(
-    name, tmp_path, capsys, monkeypatch
-):
+def test_names_with_spaces_are_warned_of_in_the_log_and_on_the_terminal(name, tmp_path, capsys):
     terminal = io.StringIO()
-    monkeypatch.setattr(Progress, "terminal", terminal)
-    assert export(tmp_path, ["a.jpg", name], [[0, 1]]) == f"a.jpg {name}\n"
+    assert export(tmp_path, ["a.jpg", name], [[0, 1]], terminal) == f"a.jpg {name}\n"
     assert f"warning: {export_hloc.SPACES}\n" in capsys.readouterr().err
     assert terminal.getvalue() == f"snakesfm: scene 'scene': warning: {export_hloc.SPACES}\n"
 

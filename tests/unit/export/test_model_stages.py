@@ -19,6 +19,7 @@ from snakesfm.artifacts import (
     CameraRotations,
     Header,
     ImageIndex,
+    LocalFeatures,
     Reconstruction,
     TrackTable,
     TriangulatedPoints,
@@ -90,10 +91,10 @@ def write_index(
     return folder / "index.h5"
 
 
-def write_cameras(folder: Path) -> Path:
+def write_cameras(folder: Path, focal_sigma: tuple[float, float] = (0.0, 0.0)) -> Path:
     models, sizes, params, sources = cameras_to_columns([CAMERA, CAMERA])
     CalibratedCameras(
-        models, sizes, params, sources, np.zeros(2), np.zeros(2, int), np.zeros((0, 4), int), [OVERLAY]
+        models, sizes, params, sources, focal_sigma, np.zeros(2, int), np.zeros((0, 4), int), [OVERLAY]
     ).write(folder / "cameras.h5", HEADER)
     return folder / "cameras.h5"
 
@@ -137,6 +138,27 @@ def write_reconstruction(
     return folder / "reconstruction.h5"
 
 
+def write_features(folder: Path, problem: SyntheticProblem) -> Path:
+    """The keypoints a quarter of a pixel from where they were refined to, and one of no point in each image."""
+    keypoints = [np.vstack([found + 0.25, [[7.0, 9.0]]]) for found in problem.keypoints]
+    counts = [len(found) for found in keypoints]
+    total = sum(counts)
+    LocalFeatures(
+        image_ids=np.arange(COUNT),
+        names=NAMES,
+        digests=["d"] * COUNT,
+        sizes=np.tile([640, 480], (COUNT, 1)),
+        offsets=np.concatenate([[0], np.cumsum(counts)]),
+        keypoints=np.concatenate(keypoints).astype(np.float32),
+        descriptors=np.zeros((total, 0), np.uint8),
+        scores=np.ones(total, np.float32),
+        scales=np.ones(total, np.float32),
+        angles=np.zeros(total, np.float32),
+        colors=np.zeros((total, 3), np.uint8),
+    ).write(folder / "features.h5", HEADER)
+    return folder / "features.h5"
+
+
 def make_images(folder: Path) -> Path:
     for name in NAMES:
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
@@ -158,6 +180,7 @@ def export(
     inputs = {
         "index": str(write_index(tmp_path, orientations, gps)),
         "cameras": str(write_cameras(tmp_path)),
+        "features": [str(write_features(tmp_path, problem))],
         "reconstruction": str(write_reconstruction(tmp_path, problem, lost, reset, offset)),
     }
     folder = tmp_path / "out" / "scene" / "export_model"
@@ -205,6 +228,23 @@ def test_colmap_reads_what_was_reconstructed_from_binary_and_text(tmp_path, prob
         assert observed.xy == pytest.approx(expected, abs=1e-5)
 
 
+def test_all_keypoints_are_numbered_as_the_features_are(tmp_path, problem) -> None:
+    model = read_model(export(tmp_path, problem, all_keypoints=True) / "sparse" / "0")
+    some = read_model(export(tmp_path / "some", problem) / "sparse" / "0")
+    for image_id, image in model.images.items():
+        keypoints = problem.keypoints[image_id - 1]
+        pixels = np.array([point.xy for point in image.points2D])
+        np.testing.assert_allclose(pixels, np.vstack([keypoints, [[7, 9]]]), atol=1e-4)
+        assert [point.has_point3D() for point in image.points2D] == [True] * len(keypoints) + [False]
+        assert some.images[image_id].num_points2D() == len(keypoints)
+    for point_id, point in model.points3D.items():
+        assert np.allclose(point.xyz, some.points3D[point_id].xyz)
+        rows = slice(*problem.track_offsets[point_id - 1 : point_id + 1])
+        there = zip(problem.track_image_ids[rows] + 1, problem.track_keypoint_ids[rows], strict=True)
+        found = [(element.image_id, element.point2D_idx) for element in point.track.elements]
+        assert found == [(i, k) for i, k in there if i != LOST + 1]
+
+
 def test_reprojection_in_the_exported_model_is_that_of_the_noise(tmp_path, problem) -> None:
     pinhole = make_problem(camera_count=COUNT, point_count=300, noise_px=0.3, camera=CAMERA)
     model = pycolmap.Reconstruction(str(export(tmp_path, pinhole) / "sparse" / "0"))
@@ -245,7 +285,10 @@ def test_summary_says_what_is_there_and_what_is_missing(tmp_path, problem) -> No
     assert (summary["images"], summary["registered_images"]) == (COUNT, COUNT - 1)
     assert summary["not_registered"] == [NAMES[LOST]]
     assert summary["points"] == len(problem.points)
-    assert 0.1 < summary["mean_reprojection_error_px"] < 0.5
+    model = Reconstruction.read(tmp_path / "reconstruction.h5")
+    mean_px = np.average(model.errors_px, weights=np.diff(model.offsets))
+    assert abs(mean_px - model.errors_px.mean()) > 1e-4
+    assert summary["mean_reprojection_error_px"] == pytest.approx(mean_px)
     assert summary["mean_track_length"] == pytest.approx(summary["observations"] / summary["points"])
     spaces, refused, doubted, overlay = summary["warnings"]
     assert (doubted, overlay) == ("5 images have a camera each.", OVERLAY)
@@ -598,7 +641,8 @@ def write_former_stages(folder: Path, problem: SyntheticProblem) -> dict[str, ob
     log = folder / "logs" / "match_pairs" / "0-0.log"
     log.parent.mkdir(parents=True)
     log.write_text(describe_cost("match_pairs", 0.0, 12.5, 12.0, 321.0) + "\n", "utf-8")
-    names = ("graph", "rotations", "tracks", "points", "index", "reconstruction")
+    write_cameras(folder, (0.02, np.nan))
+    names = ("cameras", "graph", "rotations", "tracks", "points", "index", "reconstruction")
     inputs: dict[str, object] = {name: str(folder / f"{name}.h5") for name in names}
     # of a run with more blocks
     (log.parent / "2-3.log").write_text(describe_cost("match_pairs", 0.0, 70.0, 7.0, 9.0) + "\n", "utf-8")
@@ -635,6 +679,7 @@ def test_report_says_what_happened_and_escapes_names(tmp_path, problem) -> None:
     lost = int((problem.pairs == LOST).any(axis=1).sum())
     assert f"None of its {lost} pairs was accepted: too few inliers ({lost})." in page
     assert "cycle_median" in page
+    assert "focal lengths: 2 given; median standard deviation 2.0 %" in page
     assert "12.5" in page and "82.5" not in page
     assert "relative pose AUC" in page
     assert page.count("<title>") >= 2 * 8

@@ -10,10 +10,10 @@ import pycolmap
 import pytest
 
 from snakesfm.errors import ConfigError
-from snakesfm.export.colmap import build_reconstruction, registered_images
+from snakesfm.export.colmap import build_reconstruction
 from snakesfm.geometry import colmap_files
 from snakesfm.geometry.camera import Camera
-from snakesfm.geometry.poses import to_rigid3d
+from snakesfm.geometry.poses import has_pose, to_rigid3d
 from snakesfm.synthetic.problems import make_problem
 
 COUNT = 30
@@ -76,7 +76,7 @@ def object_by_object(
     keypoints,
 ):
     """The same by pycolmap's objects alone."""
-    registered = registered_images(rotations, translations).tolist()
+    registered = np.flatnonzero(has_pose(rotations, translations)).tolist()
     model = pycolmap.Reconstruction()
     for row in sorted({int(camera_ids[image]) for image in registered}):
         model.add_camera_with_trivial_rig(cameras[row].to_pycolmap(row + 1))

@@ -1,8 +1,10 @@
 """Images that cannot be read now, or are others than when they were indexed, are not taken for damaged ones."""
 
+import io
 import resource
 import subprocess
 import sys
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -19,7 +21,7 @@ from snakesfm.ingest.discover import digest_images
 from snakesfm.ingest.indexed import IndexedImages
 from snakesfm.stages import extract_features, index_images, match_pairs, merge_keypoints
 from snakesfm.stages.adjust_bundle import _image_sources
-from snakesfm.stages.job import Progress, StageJob
+from snakesfm.stages.job import StageJob
 
 NAMES = ["a.jpg", "b.png", "c.tif"]
 SIZE = (320, 240)
@@ -44,7 +46,7 @@ def images(tmp_path):
 def index_of(images):
     sha256 = list(digest_images(images, NAMES).values())
     write_plain_index(images.parent / "index.h5", NAMES, [SIZE] * len(NAMES), sha256)
-    return ImageIndex.read(images.parent / "index.h5")
+    return IndexedImages(np.array(NAMES), np.array(sha256), images)
 
 
 def job_of(stage, images, options):
@@ -71,7 +73,7 @@ def turn_around(path):
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("fault", [hide, forbid, turn_around])
 def test_a_file_that_cannot_be_read_now_ends_the_job(images, name, fault):
-    reader = IndexedImages(index_of(images), images)
+    reader = index_of(images)
     assert reader.read(NAMES.index(name)).gray.shape == SIZE[::-1]
     fault(images / name)
     with pytest.raises(SceneError, match=rf"{name} could not be read .*: start the same command again"):
@@ -80,7 +82,7 @@ def test_a_file_that_cannot_be_read_now_ends_the_job(images, name, fault):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_other_content_than_was_indexed_ends_the_job(images, name):
-    reader = IndexedImages(index_of(images), images)
+    reader = index_of(images)
     draw(images / name, 9)
     with pytest.raises(SceneError, match=rf"{name} was changed after .*: start the same command again"):
         reader.read(NAMES.index(name))
@@ -104,31 +106,35 @@ def test_a_lost_image_leaves_no_features_and_the_next_run_finds_them(images):
 
 @pytest.mark.parametrize("stage", ["match_pairs", "merge_keypoints", "adjust_bundle"])
 def test_no_stage_takes_a_lost_image_for_a_damaged_one(images, stage):
-    index = index_of(images)
+    reader = index_of(images)
     hide(images / "a.jpg")
     with pytest.raises(SceneError, match=r"a\.jpg could not be read"):
         if stage == "match_pairs":
             match_pairs.ImageFiles(job_of(stage, images, MatchPairsOptions(method="loftr"))).read(0)
         elif stage == "merge_keypoints":
-            merge_keypoints._read_colors(IndexedImages(index, images), 0, np.ones((1, 2), np.float32))
+            merge_keypoints._read_colors(reader, 0, np.ones((1, 2), np.float32))
         else:
             job = job_of(stage, images, AdjustBundleOptions())
-            _image_sources(job, index)[0].read_gray(0)
+            _image_sources(job, ImageIndex.read(job.path("index")))[0].read_gray(0)
 
 
-def test_a_damaged_image_is_left_out_and_the_terminal_says_so(images, capsys, monkeypatch):
+def test_a_damaged_image_is_left_out_and_the_terminal_says_so(images, capsys):
     damaged = bytearray((images / "b.png").read_bytes())
     damaged[len(damaged) // 2 : len(damaged) // 2 + 64] = bytes(64)
     (images / "b.png").write_bytes(damaged)
     index_of(images)
-    monkeypatch.setattr(Progress, "terminal", sys.stdout)
+    terminal = io.StringIO()
     job = job_of("extract_features", images, ExtractFeaturesOptions(max_keypoints=200))
-    extract_features.run(job)
+    extract_features.run(replace(job, terminal=terminal))
     counts = np.diff(LocalFeatures.read(job.output).offsets)
     assert counts[1] == 0 and min(counts[0], counts[2]) > 50
-    told = [line for line in capsys.readouterr().out.splitlines() if line.startswith("snakesfm: ")]
-    assert len(told) == 1
-    assert "scene 'scene': warning: 1 images cannot be decoded" in told[0] and "b.png is damaged" in told[0]
+    assert "b.png is damaged" in capsys.readouterr().out
+    assert (
+        "warning: 1 of 3 images have no keypoints" in terminal.getvalue() and "b.png" in terminal.getvalue()
+    )
+    matched = match_pairs.ImageFiles(job_of("match_pairs", images, MatchPairsOptions(method="loftr")))
+    assert not matched.read(1).gray.any() and matched.read(0).gray.any()
+    assert list(matched.images.damaged) == [1] and "b.png is damaged" in matched.images.damaged[1]
 
 
 CODE = f"""

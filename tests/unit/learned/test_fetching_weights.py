@@ -6,13 +6,13 @@ import zipfile
 
 import pytest
 
+from snakesfm.digests import sha256_of
 from snakesfm.errors import ConfigError
 from snakesfm.learned import fetch
 from snakesfm.learned.fetch import fetch_weights, main
 from snakesfm.learned.weights import (
     WEIGHT_FILES,
     WeightFile,
-    file_sha256,
     find_weights,
     read_sums,
     weights_digest,
@@ -67,7 +67,7 @@ def test_without_a_known_sum_the_first_download_counts(monkeypatch, source, fold
         fetch_weights(["net"], folder)
     source.write_bytes(CONTENT)
     fetch_weights(["net"], folder)
-    assert file_sha256(folder / "net.bin") == SUM
+    assert sha256_of(folder / "net.bin") == SUM
 
 
 def test_a_file_comes_out_of_an_installed_package(monkeypatch, folder):

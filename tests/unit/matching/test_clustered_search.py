@@ -3,7 +3,7 @@ import pytest
 
 from snakesfm.features.sift import rootsift
 from snakesfm.matching import clustered
-from snakesfm.matching.clustered import ClusteredSearch, learn_codebook
+from snakesfm.matching.clustered import ClusteredSearch, learn_small_codebook
 from snakesfm.matching.nearest import ExactSearch
 
 RATIO = 0.8
@@ -136,7 +136,8 @@ def test_no_second_nearest_no_match():
 
 def test_codebook_of_integers_is_of_integers_and_of_floats_is_not():
     first, _, _ = scene(8)
-    whole, real = learn_codebook(first, 16), learn_codebook((first / 512).astype(np.float16), 16)
+    whole = learn_small_codebook(first, 16)
+    real = learn_small_codebook((first / 512).astype(np.float16), 16)
     np.testing.assert_array_equal(whole, np.rint(whole))
     np.testing.assert_allclose(whole, real * 512, atol=20)
     assert len(np.unique(whole, axis=0)) == 16 and (real != np.rint(real)).any()
@@ -144,6 +145,6 @@ def test_codebook_of_integers_is_of_integers_and_of_floats_is_not():
 
 def test_codebook_of_equal_descriptors():
     same = np.full((2000, 128), 7, np.uint8)
-    np.testing.assert_array_equal(learn_codebook(same, 16), np.full((16, 128), 7))
+    np.testing.assert_array_equal(learn_small_codebook(same, 16), np.full((16, 128), 7))
     search = ClusteredSearch.build(same, 16, 3)
     assert len(search.match(same, RATIO)[0]) <= 1

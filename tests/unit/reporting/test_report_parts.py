@@ -1,6 +1,7 @@
 """Reasons, counts and plots of the report."""
 
 import base64
+import dataclasses
 import re
 
 import cv2
@@ -10,13 +11,20 @@ import pytest
 from snakesfm.geometry.camera import Camera, observation_errors
 from snakesfm.geometry.poses import translation_of
 from snakesfm.geometry.rotations import exp_so3
+from snakesfm.reporting.page import Page, render_page
 from snakesfm.reporting.plots import error_histogram, scene_map, view_axes
 from snakesfm.reporting.registration import (
     ImageCounts,
     mean_by_image,
     reason_not_registered,
 )
-from snakesfm.reporting.tables import image_table, label_counts, metric_tables
+from snakesfm.reporting.tables import (
+    ROUND_HEADS,
+    bundle_rows,
+    image_table,
+    label_counts,
+    metric_tables,
+)
 from snakesfm.synthetic.layouts import look_at
 from snakesfm.synthetic.problems import make_problem
 
@@ -137,12 +145,49 @@ def test_metrics_are_grouped_by_threshold_and_statistic_without_texts() -> None:
     assert others[2] == [["points", 3]]
 
 
+def test_rounds_have_what_their_heads_name() -> None:
+    rows = bundle_rows(
+        np.array(["10 px"]), np.array([[9, 300, 900]]), np.array([[4.0, 3.5]]), np.array([0.6])
+    )
+    (row,) = (dict(zip(ROUND_HEADS, row, strict=True)) for row in rows)
+    assert row == {
+        "round": "10 px",
+        "images": 9,
+        "points": 300,
+        "observations": 900,
+        "cost before": 4.0,
+        "cost after": 3.5,
+        "mean error, detector px": 0.6,
+    }
+
+
+def test_refused_files_are_shown_where_every_image_has_a_pose() -> None:
+    page = Page("scene", "lead", "snakesfm", [["total", 1234.6, 12.342, 5000]], list("abcd"), [], [])
+    text = render_page(page)
+    assert "could not be used" not in text and "every image has a pose" in text
+    numbers = re.findall(r'<td class="n">([^<]*)</td>', text)
+    assert numbers == ["1,235", "12.34", "5,000"]
+    text = render_page(dataclasses.replace(page, refused=[["a.jpg", "no image"]]))
+    assert "Files that could not be used" in text and "a.jpg" in text
+
+
 def test_histogram_has_all_errors_and_bears_none() -> None:
     errors = np.abs(np.random.default_rng(0).normal(size=1000))
     bars = re.findall(r"px: (\d+)</title>", error_histogram(errors))
     assert sum(map(int, bars)) == 1000
     assert error_histogram(np.full(3, np.nan)) == ""
     assert "<svg" in error_histogram(np.zeros(4))
+
+
+def test_histogram_ends_where_hardly_an_error_is_larger() -> None:
+    errors = np.concatenate([np.linspace(0.0, 8.0, 1000), [500.0] * 5])
+    svg = error_histogram(errors, bins=4)
+    ticks = [float(text) for text in re.findall(r">([^<>]*) px</text>", svg)]
+    assert ticks == pytest.approx([0, 2, 4, 6, 8], rel=0.05)
+    # the far ones are in the last bar
+    assert [int(count) for count in re.findall(r"px: (\d+)</title>", svg)] == pytest.approx(
+        [250, 250, 250, 255], abs=5
+    )
 
 
 def test_up_is_that_of_the_cameras_in_any_world() -> None:
@@ -159,11 +204,35 @@ def test_up_is_that_of_the_cameras_in_any_world() -> None:
 
 def test_up_of_cameras_that_look_down_from_all_sides_is_against_their_view() -> None:
     rng = np.random.default_rng(0)
-    down = np.array([[1.0, 0, 0], [0, -1, 0], [0, 0, -1]])
-    rotations = np.array([exp_so3(np.array([0, 0, a])) @ down for a in np.linspace(0, 2 * np.pi, 9)[:-1]])
+    turns = [exp_so3(np.array([0, 0, angle])) for angle in np.linspace(0, 2 * np.pi, 9)[:-1]]
     centers = np.column_stack([rng.uniform(-9, 9, (8, 2)), 20 + rng.normal(0, 0.01, 8)])
-    axes = view_axes(rotations, translation_of(rotations, centers))
-    assert axes[2] == pytest.approx([0.0, 0.0, 1.0], abs=0.01)
+    # the same centres, from which they look down or up
+    for look, up in ((np.diag([1.0, -1, -1]), 1.0), (np.eye(3), -1.0)):
+        rotations = np.array([turn @ look for turn in turns])
+        axes = view_axes(rotations, translation_of(rotations, centers))
+        assert axes[2] == pytest.approx([0.0, 0.0, up], abs=0.01)
+
+
+def test_the_map_is_seen_from_above_with_the_first_axis_to_the_right() -> None:
+    # towards x and y of the world, their images upright
+    rotations = np.array([[[0.0, -1, 0], [0, 0, -1], [1, 0, 0]], [[1, 0, 0], [0, 0, -1], [0, 1, 0]]])
+    centers = np.array([[0.0, 0, 0], [10, 20, 0]])
+    points = np.array([[5.0, 10, 3], [5, 10, 1], [5, 10, 2]])
+    colors = np.array([[255, 0, 0], [0, 255, 0], [0, 0, 255]], np.uint8)
+    svg = scene_map(
+        ["low", "high"], rotations, translation_of(rotations, centers), points, colors, np.eye(3)
+    )
+    marks = re.findall(r"translate\(([\d.]+) ([\d.]+)\) rotate\((-?\d+)\)", svg)
+    (low_x, low_y, east), (high_x, high_y, north) = (map(float, mark) for mark in marks)
+    assert (east, north) == (0, -90)
+    assert high_x - low_x == pytest.approx((low_y - high_y) / 2, rel=0.02) and high_x > low_x
+    # the highest of the points hides the others
+    data = re.search(r"base64,([^\"]+)", svg)
+    picture = cv2.imdecode(np.frombuffer(base64.b64decode(data[1]), np.uint8), cv2.IMREAD_UNCHANGED)
+    assert {tuple(pixel) for pixel in picture[picture[..., 3] > 0].tolist()} == {(0, 0, 255, 255)}
+    rows, columns = np.nonzero(picture[..., 3])
+    assert columns.mean() / 2 == pytest.approx((low_x + high_x) / 2, abs=1)
+    assert rows.mean() / 2 == pytest.approx((low_y + high_y) / 2, abs=1)
 
 
 @pytest.mark.parametrize("count", [1, 2, 9])

@@ -1,11 +1,13 @@
 """From images to matches by the stages themselves, on rendered images."""
 
+import io
 import shutil
 
 import cv2
 import h5py
 import numpy as np
 import pytest
+from random_weights import write_netvlad
 
 from snakesfm.artifacts import (
     GlobalDescriptors,
@@ -69,6 +71,8 @@ def images(tmp_path_factory):
 class Scene:
     """The stages from index to matches, in one folder, with a number of blocks."""
 
+    terminal = None
+
     def __init__(self, folder, images, blocks, gps=None, copies=()):
         self.folder, self.images, self.blocks = folder, images, blocks
         count = len(NAMES)
@@ -104,6 +108,7 @@ class Scene:
             options=options,
             settings=settings,
             former=former,
+            terminal=self.terminal,
         )
 
     def block_files(self, stage):
@@ -226,11 +231,16 @@ def test_features_do_not_depend_on_the_blocks(whole, dealt):
 
 
 def test_one_bad_image_is_a_warning(images, tmp_path, capsys):
-    Scene(tmp_path, images, 1).extract()
+    scene = Scene(tmp_path, images, 1)
+    scene.terminal = io.StringIO()
+    scene.extract()
     lines = capsys.readouterr().out.splitlines()
     warnings = [line for line in lines if line.startswith("warning")]
     assert len(warnings) == 1 and "gone.png" in warnings[0]
     assert lines[-1].startswith("6 images (0 taken over)")
+    (said,) = scene.terminal.getvalue().splitlines()
+    assert said.startswith("snakesfm: scene 'scene': warning: 2 of 6 images have no keypoints")
+    assert "'flat.png'" in said
 
 
 def test_colors_are_those_of_the_image(whole, images):
@@ -246,6 +256,21 @@ def test_vocabulary_and_pairs_do_not_depend_on_the_blocks(whole, dealt):
     )
     options = SelectPairsOptions(method="sequential+retrieval", look_ahead=1, top_k=2)
     assert str(whole.select(options)) == str(dealt.select(options))
+
+
+def test_a_picture_that_cannot_be_read_resembles_none(images, tmp_path):
+    pytest.importorskip("torch")
+    scene = Scene(tmp_path, images, 1)
+    scene.terminal = io.StringIO()
+    write_netvlad(tmp_path / "netvlad_pitts30k.mat")
+    told = {"images": str(images), "block": 0, "weights": str(tmp_path), "models": ["netvlad"], "fetch": ""}
+    output = scene.file("descriptors")
+    inputs = {"index": [scene.file("index")]}
+    options = DescribeImagesOptions(method="netvlad")
+    describe_images.run(scene.job("describe_images", options, inputs, [output], **told))
+    lengths = np.linalg.norm(GlobalDescriptors.read(output).descriptors, axis=1)
+    np.testing.assert_allclose(lengths[[0, 1, 3, 4, 5]], [1, 1, 0, 1, 1], atol=1e-3)
+    assert "warning: 1 of 6 images cannot be read" in scene.terminal.getvalue()
 
 
 def test_retrieval_prefers_what_overlaps(dealt):
@@ -296,10 +321,13 @@ def test_copies_of_an_image_are_left_out_but_where_a_list_names_them(images, tmp
     assert [pair for pair, *_ in scene.select(SelectPairsOptions(method="listed"), str(path))] == [(0, 1)]
 
 
-def test_a_list_is_followed(dealt, tmp_path):
+def test_a_list_is_followed(dealt, tmp_path, monkeypatch):
     path = tmp_path / "my pairs.txt"
     path.write_text("\ufeffb/ü 2.png a/1 #{x}.png\nother.png bad.jpg\n", "utf-8")
+    terminal = io.StringIO()
+    monkeypatch.setattr(dealt, "terminal", terminal)
     rows = dealt.select(SelectPairsOptions(), str(path))
+    assert f"warning: 1 pairs of '{path}' are left out" in terminal.getvalue()
     assert [(pair, reason) for pair, reason, *_ in rows] == [((0, 1), "listed")]
     path.write_text("b/ü 2.png nobody.png\n", "utf-8")
     with pytest.raises(ConfigError, match=r"my pairs.txt:1.*nobody"):
@@ -317,7 +345,7 @@ def test_the_pairs_of_a_file_of_matches_are_followed(dealt, tmp_path, capsys):
             file[f"{pair}/matches0"] = np.array([-1])
     rows = dealt.select(SelectPairsOptions(exhaustive_up_to=2), str(path))
     assert [(pair, reason) for pair, reason, *_ in rows] == [((0, 1), "listed"), ((2, 3), "listed")]
-    lines = capsys.readouterr().out.splitlines()
+    lines = capsys.readouterr().err.splitlines()
     assert [line for line in lines if line.startswith("warning: 1 pairs of") and "matches.h5" in line]
     with h5py.File(path, "w") as file:
         file["images/a/1.png/matches0"] = np.array([-1])
@@ -330,16 +358,17 @@ def test_the_pairs_of_a_file_of_matches_are_followed(dealt, tmp_path, capsys):
         dealt.select(SelectPairsOptions(), str(path))
 
 
-def test_neighbours_by_gps_are_those_on_the_ground(tmp_path, capsys):
+def test_neighbours_by_gps_are_those_on_the_ground(tmp_path):
     gps = np.array([[47.0, 8.0 + 1e-4 * k, 400.0 * (k % 2)] for k in range(6)])
     gps[2, 2], gps[5] = np.nan, np.nan
     scene = Scene(tmp_path, tmp_path, 2, gps=gps)
+    scene.terminal = io.StringIO()
     rows = scene.select(SelectPairsOptions(method="spatial", preview_keypoints=0, top_k=1))
     by_place = {pair for pair, reason, *_ in rows if reason == "spatial"}
     assert {(0, 1), (3, 4)} <= by_place <= {(a, a + 1) for a in range(4)}
     # the image without a position is the last by name
     assert {(pair, reason) for pair, reason, *_ in rows if reason != "spatial"} == {((4, 5), "sequential")}
-    assert "1 of 6 images have no GPS" in capsys.readouterr().err
+    assert "warning: 1 of 6 images have no GPS" in scene.terminal.getvalue()
     both = scene.select(
         SelectPairsOptions(method="sequential+spatial", preview_keypoints=0, top_k=2, look_ahead=1)
     )

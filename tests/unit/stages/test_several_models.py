@@ -117,6 +117,28 @@ def test_a_part_without_centres_is_no_model(scene, tmp_path, capsys):
     assert len(model.points) > 100
 
 
+def test_a_part_that_comes_apart_leaves_no_intrinsics_behind(scene, tmp_path):
+    centers = CameraCenters.read(scene["centers"])
+    scattered = np.random.default_rng(0).normal(0.0, 30.0, (LARGE, 3))
+    found = []
+    for name, wrong in (("apart", scattered), ("absent", np.nan)):
+        inputs = scene | {"centers": tmp_path / f"{name}.h5"}
+        mine = centers.centers.copy()
+        mine[PART] = wrong
+        replace(centers, centers=mine).write(inputs["centers"], HEADER)
+        # completion and registration would mend the part
+        options = AdjustBundleOptions(
+            refine_keypoints=False, complete_tracks=False, register_images=False, min_observations=40
+        )
+        run(adjust_bundle, options, inputs, tmp_path / "model.h5", intrinsics="refine", images="")
+        found.append(Reconstruction.read(tmp_path / "model.h5"))
+    apart, absent = found
+    assert apart.round_counts[apart.round_names.tolist().index("last pass"), 0] < 2
+    np.testing.assert_array_equal(apart.models, np.where(PART, -1, 0))
+    for column in ("camera_params", "camera_resets", "camera_offsets", "rotations", "points", "keypoints"):
+        np.testing.assert_array_equal(getattr(apart, column), getattr(absent, column))
+
+
 def test_a_part_is_given_its_own_images_and_those_tied_to_it(made, scene, tmp_path, monkeypatch):
     left_out = np.array([3, SMALL + 4])
     averaged = CameraRotations.read(scene["rotations"])

@@ -1,9 +1,11 @@
-import dataclasses
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from snakesfm.config.average_translations import AverageTranslationsOptions
 from snakesfm.geometry.rotations import angle_between
+from snakesfm.stages.average_translations import positioning_settings
 from snakesfm.synthetic.problems import make_problem, perturb_rotations
 from snakesfm.translation_averaging.angular import refine_angles
 from snakesfm.translation_averaging.average import (
@@ -12,13 +14,7 @@ from snakesfm.translation_averaging.average import (
     average_translations,
     normalize_gauge,
 )
-from snakesfm.translation_averaging.averagers import (
-    GlobalPositioning,
-    ScaleChain,
-    TranslationRecovery,
-    share_at_one_scale,
-    with_rays,
-)
+from snakesfm.translation_averaging.averagers import share_at_one_scale, with_rays
 from snakesfm.translation_averaging.landmarks import cover_cameras, edge_angles_rad, intersect
 from snakesfm.translation_averaging.problem import (
     PositioningProblem,
@@ -28,9 +24,21 @@ from snakesfm.translation_averaging.problem import (
 )
 from snakesfm.translation_averaging.recovery import mfas_weights
 from snakesfm.translation_averaging.scale_chain import chain_centers, refine_directions, shared_rays
-from snakesfm.translation_averaging.support import SupportLimits, held_cameras
+from snakesfm.translation_averaging.support import held_cameras
 
-LIMITS = SupportLimits()
+
+def settings(**options):
+    """What the options' defaults with changes say, and no restarts if not told."""
+    return positioning_settings(AverageTranslationsOptions(**{"restarts": 0} | options), 0)
+
+
+def averager(method, **options):
+    return settings(method=method, **options).averager
+
+
+SETTINGS = settings()
+LIMITS = SETTINGS.limits
+CHAIN = SETTINGS.averager
 
 
 def positioning(truth, rotations=None):
@@ -67,7 +75,8 @@ class Misled:
 def test_positions_with_which_few_rays_agree_are_looked_for_again(restarts):
     truth = make_problem(20, 1500, "street", noise_px=0.3, rotation_noise_deg=0.05, seed=2)
     problem = positioning(truth)
-    found = average_translations(problem, Misled(), LIMITS, refine=False, restarts=restarts)
+    misled = replace(settings(refine=False, restarts=restarts), averager=Misled())
+    found = average_translations(problem, misled)
     share = agreeing_share(problem, found.centers, LIMITS)
     size = np.ptp(truth.centers, axis=0).max()
     if restarts:
@@ -82,8 +91,8 @@ def test_positions_with_which_few_rays_agree_are_looked_for_again(restarts):
 
 def test_positions_with_which_rays_agree_are_final():
     problem = positioning(make_problem(12, 600, "area", noise_px=0.3, rotation_noise_deg=0.05, seed=3))
-    once = average_translations(problem, ScaleChain(), LIMITS)
-    again = average_translations(problem, ScaleChain(), LIMITS, restarts=3)
+    once = average_translations(problem, SETTINGS)
+    again = average_translations(problem, settings(restarts=3))
     for name, values in vars(once).items():
         np.testing.assert_array_equal(getattr(again, name), values)
 
@@ -188,7 +197,7 @@ def two_clusters(edges_between):
     kept[np.flatnonzero(across)[edges_between]] = True
     tracks = 2 * problem.ray_tracks + second[problem.ray_images]
     order = np.lexsort((problem.ray_images, tracks))
-    apart = dataclasses.replace(
+    apart = replace(
         problem,
         ray_images=problem.ray_images[order],
         ray_tracks=tracks[order],
@@ -201,9 +210,9 @@ def two_clusters(edges_between):
 def test_clusters_without_common_landmarks_are_joined_by_edges(averager):
     truth, problem, second = two_clusters(slice(0, 40, 10))
     if averager == "chain":
-        centers = chain_centers(problem, np.radians(0.45))
+        centers = chain_centers(problem, np.radians(0.45), 0.1)
     else:
-        centers = average_translations(problem, ScaleChain(), LIMITS).centers
+        centers = average_translations(problem, SETTINGS).centers
     assert np.isfinite(centers).all()
     extent = np.linalg.norm(np.ptp(truth.centers, axis=0))
     assert errors(centers, truth.centers).max() < 0.02 * extent
@@ -216,7 +225,7 @@ def test_a_wrong_edge_between_clusters_is_outvoted():
     across = np.flatnonzero(second[problem.pairs[:, 0]] != second[problem.pairs[:, 1]])
     directions = problem.directions.copy()
     directions[across[0]] = np.roll(directions[across[0]], 1)
-    centers = chain_centers(dataclasses.replace(problem, directions=directions), np.radians(0.45))
+    centers = chain_centers(replace(problem, directions=directions), np.radians(0.45), 0.1)
     extent = np.linalg.norm(np.ptp(truth.centers, axis=0))
     assert np.isfinite(centers).all() and errors(centers, truth.centers).max() < 0.02 * extent
 
@@ -224,7 +233,7 @@ def test_a_wrong_edge_between_clusters_is_outvoted():
 @pytest.mark.parametrize("edges_between", [slice(0, 0), slice(0, 1)])
 def test_a_cluster_stays_out_where_edges_do_not_tell_its_scale(edges_between):
     truth, problem, second = two_clusters(edges_between)
-    centers = chain_centers(problem, np.radians(0.45))
+    centers = chain_centers(problem, np.radians(0.45), 0.1)
     assert np.array_equal(np.isfinite(centers[:, 0]), ~second)
     assert errors(centers, truth.centers).max() < 0.005 * np.linalg.norm(np.ptp(truth.centers, axis=0))
 
@@ -239,7 +248,7 @@ def test_a_cluster_stays_out_where_edges_contradict_each_other_or_its_direction(
         others /= np.linalg.norm(others, axis=1, keepdims=True)
     elif directions == "negated":
         others[across] *= -1.0
-    centers = chain_centers(dataclasses.replace(problem, directions=others), np.radians(0.45))
+    centers = chain_centers(replace(problem, directions=others), np.radians(0.45), 0.1)
     assert np.isfinite(centers[~second]).all()
     assert np.isfinite(centers[second, 0]).sum() == count
 
@@ -268,7 +277,7 @@ def test_whether_a_camera_is_held_does_not_depend_on_the_scale(scale):
     problem = problem.select_edges((problem.pairs != 4).all(axis=1))
     mine = problem.ray_images == 4
     narrow = np.degrees(angle_between(problem.rays, problem.rays[mine].mean(axis=0))) < 8.0
-    limits = SupportLimits(max_relative_sigma=0.01)
+    limits = replace(LIMITS, max_relative_sigma=0.01)
     for rays, kept in ((np.ones_like(mine), True), (~mine | narrow, False)):
         some = problem.select_rays(rays)
         assert np.count_nonzero(some.ray_images == 4) > limits.min_support
@@ -281,7 +290,7 @@ def test_refinement_improves_a_disturbed_start_and_keeps_missing_cameras():
     problem = positioning(truth)
     start = truth.centers + np.random.default_rng(0).normal(0, 0.2, truth.centers.shape)
     start[4] = np.nan
-    refined, points = refine_angles(problem, start, np.radians(0.1))
+    refined, points = refine_angles(problem, start, np.radians(0.1), 0.1)
     assert np.isnan(refined[4]).all()
     keep = np.arange(20) != 4
     assert errors(refined, truth.centers).max() < 0.05
@@ -304,11 +313,11 @@ def test_landmarks_of_very_many_rays_are_cut_and_say_the_same(monkeypatch):
         cameras, pairs, directions, np.full(len(pairs), 0.01), images, tracks, rays
     )
     start = centers + rng.normal(0, 0.05, centers.shape)
-    cut, spots = refine_angles(problem, start, 1e-3)
+    cut, spots = refine_angles(problem, start, 1e-3, 0.1)
     monkeypatch.setattr("snakesfm.translation_averaging.angular.RAYS_PER_LANDMARK", cameras)
-    whole, _ = refine_angles(problem, start, 1e-3)
+    whole, _ = refine_angles(problem, start, 1e-3, 0.1)
     monkeypatch.setattr("snakesfm.translation_averaging.angular.PAIRS_AT_ONCE", 1000)
-    pieces, _ = refine_angles(problem, start, 1e-3)
+    pieces, _ = refine_angles(problem, start, 1e-3, 0.1)
     np.testing.assert_allclose(pieces, whole, atol=1e-9)
     assert not np.array_equal(cut, whole)
     assert errors(cut, centers).mean() < 1.3 * errors(whole, centers).mean()
@@ -327,7 +336,7 @@ def test_mfas_weighs_wrong_directions_more():
 def test_whole_averaging_with_noise_and_outliers(layout):
     truth = make_problem(40, 2400, layout, 0.7, 0.1, 0.5, 0.1, seed=1)
     problem = positioning(truth, perturb_rotations(truth.rotations, 0.1, 2))
-    result = average_translations(problem, ScaleChain(), LIMITS)
+    result = average_translations(problem, SETTINGS)
     found = errors(result.centers, truth.centers)
     assert np.isfinite(result.centers).all()
     assert 1e-4 < np.median(found) < 0.3
@@ -335,13 +344,12 @@ def test_whole_averaging_with_noise_and_outliers(layout):
     good = result.edge_residuals_rad[~truth.edge_outliers]
     assert np.degrees(np.median(good)) < 3.0
     assert np.degrees(np.median(result.ray_residuals_rad)) < 0.2
-    assert len(result.ray_tracks) == len(result.ray_residuals_rad)
 
 
 @pytest.mark.parametrize("seed", [1, 2])
 def test_scale_chain_withstands_a_third_of_wrong_pairs(seed):
     truth = make_problem(30, 1500, "area", 0.7, 0.1, 0.3, 0.35, seed=seed)
-    found = errors(ScaleChain().position(positioning(truth), 0), truth.centers)
+    found = errors(CHAIN.position(positioning(truth), 0), truth.centers)
     assert len(found) == 30
     assert 1e-4 < np.median(found) < 0.004 and found.max() < 0.04
 
@@ -355,8 +363,8 @@ def test_weak_camera_is_not_thrown_away():
     wild = rng.normal(size=(len(mine), 3))
     rays[mine] = wild / np.linalg.norm(wild, axis=1, keepdims=True)
     edges = ~(problem.pairs == 7).any(axis=1)
-    damaged = dataclasses.replace(problem.select_edges(edges), rays=rays)
-    result = average_translations(damaged, ScaleChain(), LIMITS)
+    damaged = replace(problem.select_edges(edges), rays=rays)
+    result = average_translations(damaged, SETTINGS)
     assert np.isnan(result.centers[7]).all()
     assert np.isfinite(np.delete(result.centers, 7, axis=0)).all()
     assert errors(result.centers, truth.centers).max() < 0.2
@@ -369,7 +377,7 @@ def test_camera_with_a_few_good_rays_is_placed():
     rows = np.ones(len(problem.rays), dtype=bool)
     rows[mine[12:]] = False
     few = problem.select_rays(rows).select_edges(~(problem.pairs == 7).any(axis=1))
-    result = average_translations(few, ScaleChain(), LIMITS)
+    result = average_translations(few, SETTINGS)
     assert np.isfinite(result.centers[7]).all()
     assert errors(result.centers, truth.centers)[7] < 0.2
 
@@ -378,14 +386,14 @@ def test_pairs_alone_position_what_they_determine():
     truth = make_problem(25, 1500, "area", 0.5, 0.0, 0.2, 0.1, seed=6)
     problem = positioning(truth)
     problem = problem.select_rays(np.zeros(len(problem.rays), dtype=bool))
-    result = average_translations(problem, ScaleChain(), LIMITS)
+    result = average_translations(problem, SETTINGS)
     assert np.isfinite(result.centers[:, 0]).sum() >= 20
     assert 1e-4 < np.median(errors(result.centers, truth.centers)) < 0.1
 
 
 def test_two_images_have_a_unit_baseline():
     truth = make_problem(2, 500, "facade", noise_px=0.1, rotation_noise_deg=0.0)
-    result = average_translations(positioning(truth), ScaleChain(), LIMITS)
+    result = average_translations(positioning(truth), SETTINGS)
     baseline = result.centers[1] - result.centers[0]
     assert abs(np.linalg.norm(baseline) - 1.0) < 1e-12
     assert angle_between(baseline, truth.centers[1] - truth.centers[0]) < 1e-6
@@ -393,7 +401,7 @@ def test_two_images_have_a_unit_baseline():
 
 def test_three_images():
     truth = make_problem(3, 600, "area", noise_px=0.2, rotation_noise_deg=0.1, seed=8)
-    result = average_translations(positioning(truth), ScaleChain(), LIMITS)
+    result = average_translations(positioning(truth), SETTINGS)
     assert np.isfinite(result.centers).all()
     assert errors(result.centers, truth.centers).max() < 0.05
 
@@ -404,9 +412,9 @@ def test_nothing_and_the_smaller_of_two_parts_get_no_center():
     empty = problem.select_edges(np.zeros(len(problem.pairs), bool)).select_rays(
         np.zeros(len(problem.rays), bool)
     )
-    assert np.isnan(average_translations(empty, ScaleChain(), LIMITS).centers).all()
+    assert np.isnan(average_translations(empty, SETTINGS).centers).all()
     lone = problem.select_edges(~(problem.pairs == 3).any(axis=1)).select_rays(problem.ray_images != 3)
-    result = average_translations(lone, ScaleChain(), LIMITS)
+    result = average_translations(lone, SETTINGS)
     assert np.isnan(result.centers[3]).all()
     assert np.isfinite(np.delete(result.centers, 3, axis=0)).all()
 
@@ -414,7 +422,7 @@ def test_nothing_and_the_smaller_of_two_parts_get_no_center():
 def test_gauge_and_frame():
     truth = make_problem(15, 700, "ring", noise_px=0.1)
     problem = positioning(truth)
-    result = average_translations(problem, ScaleChain(), LIMITS)
+    result = average_translations(problem, SETTINGS)
     lengths = np.linalg.norm(
         result.centers[problem.pairs[:, 1]] - result.centers[problem.pairs[:, 0]], axis=1
     )
@@ -429,29 +437,79 @@ def test_result_does_not_depend_on_the_order_of_edges():
     truth = make_problem(15, 700, "area", seed=3)
     problem = with_rays(positioning(truth), 50)
     order = np.random.default_rng(0).permutation(len(problem.pairs))
-    one = average_translations(problem, ScaleChain(), LIMITS).centers
-    two = average_translations(problem.select_edges(order), ScaleChain(), LIMITS).centers
+    one = average_translations(problem, SETTINGS).centers
+    two = average_translations(problem.select_edges(order), SETTINGS).centers
     assert np.allclose(one, two, atol=1e-6)
-    assert np.array_equal(one, average_translations(problem, ScaleChain(), LIMITS).centers)
+    assert np.array_equal(one, average_translations(problem, SETTINGS).centers)
 
 
-@pytest.mark.parametrize(("averager", "tolerance"), [(ScaleChain(), 0.0), (GlobalPositioning(), 1e-6)])
-def test_numbers_of_tracks_cost_nothing_and_change_nothing(averager, tolerance):
+@pytest.mark.parametrize(("method", "tolerance"), [("scale_chain", 0.0), ("global_positioning", 1e-6)])
+def test_numbers_of_tracks_cost_nothing_and_change_nothing(method, tolerance):
     problem = positioning(make_problem(12, 500, "area", seed=3))
     # an array of one number per track up to the highest would take terabytes
-    high = dataclasses.replace(problem, ray_tracks=problem.ray_tracks * 10**9 + 10**12)
-    few, many = (average_translations(one, averager, LIMITS) for one in (problem, high))
+    high = replace(problem, ray_tracks=problem.ray_tracks * 10**9 + 10**12)
+    few, many = (average_translations(one, settings(method=method)) for one in (problem, high))
     np.testing.assert_allclose(many.centers, few.centers, rtol=0.0, atol=tolerance)
     np.testing.assert_allclose(many.ray_residuals_rad, few.ray_residuals_rad, rtol=0.0, atol=tolerance)
-    np.testing.assert_array_equal(many.ray_tracks, few.ray_tracks * 10**9 + 10**12)
-    assert np.isfinite(few.centers).all() and len(few.ray_tracks) > 500
+    assert np.isfinite(few.centers).all() and len(few.ray_residuals_rad) > 500
 
 
 def test_loss_scale_of_global_positioning_says_which_rays_count():
     truth = make_problem(8, 150, "area", noise_px=0.5, outlier_ratio=0.1, seed=3)
-    robust, plain = (GlobalPositioning(loss_scale=scale, start="chain") for scale in (1e-3, 10.0))
+    robust, plain = (
+        averager("global_positioning", positioning_loss_scale=scale, positioning_start="chain")
+        for scale in (1e-3, 10.0)
+    )
     found = [errors(a.position(positioning(truth), 0), truth.centers) for a in (robust, plain)]
     assert 1e-4 < np.median(found[0]) < 0.1 * np.median(found[1])
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{"method": "translation_recovery"}, {"method": "global_positioning", "positioning_start": "chain"}],
+)
+def test_the_chain_of_other_averagers_has_the_options_of_its_own(options, monkeypatch):
+    problem = positioning(make_problem(10, 600, "area", seed=3))
+    told = []
+
+    def chain(rays, *limits):
+        told.append((len(rays.rays), *limits))
+        return chain_centers(rays, *limits)
+
+    monkeypatch.setattr("snakesfm.translation_averaging.averagers.chain_centers", chain)
+    few = {"rays_per_camera": 20, "ray_sigma_deg": 0.5, "max_relative_sigma": 0.2}
+    for method in ({"method": "scale_chain"}, options):
+        averager(**method, **few).position(problem, 0)
+    assert told == [(len(with_rays(problem, 20).rays), 1.5 * np.radians(0.5), 0.2)] * 2
+
+
+def test_what_the_chain_falls_back_to_has_the_options_of_recovery():
+    truth = make_problem(12, 600, "area", 0.5, 0.1, 0.3, 0.2, seed=6)
+    pairs_alone = positioning(truth)
+    pairs_alone = pairs_alone.select_rays(np.zeros(len(pairs_alone.rays), dtype=bool))
+    found = {
+        (method, reject): averager(method, reject_outliers=reject).position(pairs_alone, 0)
+        for method in ("scale_chain", "translation_recovery")
+        for reject in ("none", "residual")
+    }
+    for reject in ("none", "residual"):
+        np.testing.assert_array_equal(found["scale_chain", reject], found["translation_recovery", reject])
+    assert not np.array_equal(found["scale_chain", "none"], found["scale_chain", "residual"])
+
+
+def test_restarts_have_the_loss_of_global_positioning(monkeypatch):
+    problem = positioning(make_problem(12, 600, "area", noise_px=0.3, seed=3))
+    told = []
+
+    def position(rays, start, loss_scale, seed):
+        told.append((len(rays.rays), start, loss_scale, seed))
+        return np.zeros((rays.image_count, 3))
+
+    monkeypatch.setattr("snakesfm.translation_averaging.positioning.position_globally", position)
+    misled = settings(refine=False, restarts=2, rays_per_camera=20, positioning_loss_scale=0.2)
+    average_translations(problem, replace(misled, averager=Misled()))
+    many = len(with_rays(problem, 300).rays)
+    assert told == [(many, None, 0.2, 0), (many, None, 0.2, 1)]
 
 
 def test_cameras_at_one_scale_are_those_whose_baselines_agree():
@@ -474,15 +532,15 @@ def test_cameras_at_one_scale_are_those_whose_baselines_agree():
 def test_recovery_in_parts_at_scales_of_their_own_gives_way_to_the_chain(reject_outliers, capsys):
     truth = make_problem(40, 1600, "street", 1.0, 0.3, 1.0, 0.3, seed=5)
     problem = positioning(truth, perturb_rotations(truth.rotations, 0.2, 3))
-    averager = TranslationRecovery(reject_outliers=reject_outliers)
-    found = averager.position(problem, 0)
-    np.testing.assert_array_equal(found, ScaleChain().position(problem, 0))
+    recovery = averager("translation_recovery", reject_outliers=reject_outliers)
+    found = recovery.position(problem, 0)
+    np.testing.assert_array_equal(found, CHAIN.position(problem, 0))
     assert "scale_chain positions the cameras instead" in capsys.readouterr().out
     assert np.median(errors(found, truth.centers)) < 0.01 * np.ptp(truth.centers, axis=0).max()
 
 
 def test_recovery_at_one_scale_is_kept(capsys):
     problem = positioning(make_problem(20, 800, "area", 0.5, 0.1, 0.3, 0.1, seed=2))
-    found = TranslationRecovery(reject_outliers="none").position(problem, 0)
-    assert np.isfinite(found).all() and not np.array_equal(found, ScaleChain().position(problem, 0))
+    found = averager("translation_recovery", reject_outliers="none").position(problem, 0)
+    assert np.isfinite(found).all() and not np.array_equal(found, CHAIN.position(problem, 0))
     assert capsys.readouterr().out == ""

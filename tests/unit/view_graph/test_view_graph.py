@@ -10,7 +10,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial.transform import Rotation
 
 from snakesfm.geometry.rotations import angle_of
-from snakesfm.rotation_averaging.clusters import join_clusters, vote_between_clusters
+from snakesfm.rotation_averaging.clusters import join_by_votes, vote_between_clusters
 from snakesfm.view_graph import cycles as cycles_module
 from snakesfm.view_graph.bridges import find_bridges
 from snakesfm.view_graph.components import label_components
@@ -235,7 +235,7 @@ def test_either_end_of_a_joining_edge_may_be_in_the_smaller_cluster(small):
     pairs = np.array(sorted([*inside, joint]))
     rotations = truth[pairs[:, 1]] @ truth[pairs[:, 0]].transpose(0, 2, 1)
     trusted = (pairs != joint).any(axis=1)
-    joining, frames = join_clusters(7, pairs, rotations, np.ones(len(pairs)), trusted, 0.1)
+    joining, frames = join_by_votes(7, pairs, rotations, np.ones(len(pairs)), trusted, 0.1)
     np.testing.assert_array_equal(joining, ~trusted)
     residuals = frames[pairs[:, 1]].transpose(0, 2, 1) @ rotations @ frames[pairs[:, 0]]
     assert angle_of(residuals).max() < 1e-9

@@ -1,0 +1,141 @@
+"""What a run sets aside and locks at its start, and what it says of its scenes in the end."""
+
+import json
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from snakesfm.errors import ConfigError
+from snakesfm.job_logs import describe_cost
+from snakesfm.model_files import MODEL_FILES
+from snakesfm.plan import Plan
+from snakesfm.run import LOCK_NAME, Run
+
+MODEL = {"export_model", "evaluate_model"}
+SUMMARY = {"images": 9, "registered_images": 5, "points": 321, "mean_reprojection_error_px": 0.5}
+METRICS = {f"relative_pose_auc_{degrees}deg": 90.0 + degrees for degrees in (1, 3, 5)}
+
+
+@pytest.fixture
+def plan(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Plan:
+    """A plan of three images, in a folder without Snakemake's records."""
+    monkeypatch.chdir(tmp_path)
+    Path("scene").mkdir()
+    for number in range(3):
+        Path("scene", f"{number}.jpg").write_bytes(b"image %d" % number)
+    return Plan({"images": "scene", "output": "out"})
+
+
+@pytest.fixture
+def run(plan: Plan) -> Iterator[Run]:
+    """A run that has started."""
+    started = Run(plan)
+    started.start()
+    yield started
+    started.lock.close()
+
+
+LOOKED_AT = {Path(name).name for name in MODEL_FILES} | {"metrics.json", "metrics.csv", "index.html"}
+
+
+def write(path: str | Path, text: str = "") -> Path:
+    Path(path).parent.mkdir(parents=True, exist_ok=True)
+    Path(path).write_text(text)
+    return Path(path)
+
+
+@pytest.mark.parametrize(
+    ("asked", "forgotten"),
+    [
+        ({"out"}, LOOKED_AT),
+        ({"databases"}, {"database.db"}),
+        ({"hloc"}, {"features.h5", "matches.h5", "pairs.txt"}),
+        ({"databases", "all"}, {"database.db"} | LOOKED_AT),
+        ({"--until", "match_pairs"}, set()),
+        ({"-U", "match_pairs"}, set()),
+        ({"--omit-from", "export_model"}, set()),
+        ({"-O", "export_model"}, set()),
+        ({"--drop-metadata"}, set()),
+    ],
+)
+def test_unrecorded_results_are_made_again_where_they_are_asked_for(
+    plan: Plan, asked: set[str], forgotten: set[str]
+) -> None:
+    (scene,) = plan.scenes.values()
+    files = [write(path) for path in (*scene.final_files(), scene.database_file(), *scene.hloc_files())]
+    Run(plan).refuse_unrecorded(asked)
+    assert {file.name for file in files if file.stat().st_mtime == 1} == forgotten
+
+
+def test_a_run_holds_its_folder_from_start_to_end(plan: Plan, run: Run) -> None:
+    (scene,) = plan.scenes.values()
+    result = write(scene.final_files()[0])
+    second = Run(plan)
+    for refused in (second.start, lambda: second.refuse_unrecorded(set())):
+        with pytest.raises(ConfigError, match=rf"Another run \(process {os.getpid()} on \S+\) is writing"):
+            refused()
+    second.lock.close()
+    # nothing is touched that another run may be writing
+    assert result.stat().st_mtime > 1
+    run.finish({})
+    # or the next run would look for jobs of this one
+    assert Path("out", LOCK_NAME).read_text() == ""
+    run.lock.close()
+    second.start()
+    second.lock.close()
+
+
+def test_failed_jobs_are_told_by_their_logs(run: Run, capsys: pytest.CaptureFixture) -> None:
+    former = write("out/scene/logs/match_pairs/9-9.log", "error: of the run before\n")
+    os.utime(former, (1, 1))
+    cost = describe_cost("match_pairs", 1.0, 2.0, 2.0, 90.0)
+    write("out/scene/logs/match_pairs/0-0.log", f"12 pairs\n{cost}\n")
+    write("out/scene/logs/match_pairs/0-1.log", "12 pairs\n")
+    write("out/scene/logs/match_pairs/1-1.log", "12 pairs\nerror: It is full.\n")
+    capsys.readouterr()
+    run.fail({}, {"scene"})
+    killed, failed = capsys.readouterr().out.splitlines()
+    assert "scene 'scene' failed: match_pairs 0-1 was killed from outside" in killed
+    log = "(log: out/scene/logs/match_pairs/1-1.log)"
+    assert failed == f"snakesfm: scene 'scene' failed: It is full. {log}"
+    for number in range(12):
+        write(f"out/scene/logs/extract_features/{number}.log", f"error: {number}\n")
+    run.fail({}, {"scene"})
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) == 11
+    assert lines[-1] == "snakesfm: scene 'scene' failed: 4 more jobs."
+
+
+@pytest.mark.parametrize(
+    ("summary", "metrics", "said"),
+    [
+        ({}, {}, "5 of 9 images registered, 321 points, mean reprojection error 0.500 px, "),
+        ({"images_in_other_models": [2, 1]}, {}, " registered and 3 in 2 other models, 321 points, "),
+        ({}, {"reference_images": 7, "reference_images_present": 0}, " px, no image name occurs in the"),
+        (
+            {},
+            {"reference_images": 7, "reference_images_present": 7, **METRICS},
+            " px, relative-pose AUC 91.0/93.0/95.0 at 1/3/5 deg, ",
+        ),
+        (
+            {},
+            {"reference_images": 7, "reference_images_present": 6, **METRICS},
+            " at 1/3/5 deg over the reference's 7 images, 6 of them here, ",
+        ),
+    ],
+)
+def test_the_last_line_says_what_there_is(
+    run: Run, summary: dict, metrics: dict, said: str, capsys: pytest.CaptureFixture
+) -> None:
+    write("out/scene/export_model/summary.json", json.dumps({**SUMMARY, **summary, "warnings": ["Look."]}))
+    write("out/scene/evaluate_model/metrics.json", json.dumps(metrics))
+    capsys.readouterr()
+    run.finish({"scene": MODEL})
+    line, warning = capsys.readouterr().out.splitlines()
+    assert said in line
+    assert line.endswith("model in out/scene/export_model/sparse/0")
+    assert ("AUC" in line) == bool(metrics.get("reference_images_present"))
+    assert ("other models" in line) == bool(summary)
+    assert warning == "snakesfm: scene 'scene': warning: Look."
