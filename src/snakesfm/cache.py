@@ -1,7 +1,8 @@
 """Results shared by several runs: a folder of artifacts named by the digest of all they depend on.
 
 A stage that takes unchanged images or pairs from its former file takes them from here as well. Every image
-or pair is compared by its own digest again, so a wrong or damaged file costs time and never a result.
+or pair is compared by its own digest again, so a wrong or damaged file costs time and never a result; who
+finds one puts another in its place.
 """
 
 import contextlib

@@ -16,7 +16,6 @@ UNTOLD = frozenset(
         "images_target",
         "cameras",
         "masks",
-        "masks_content",
         "pairs_file",
         "reference",
         "imported",

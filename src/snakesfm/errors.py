@@ -3,6 +3,7 @@
 SnakesfmError            anything that ends a job with one clear sentence
 ├── ConfigError          an option, a key of config.yaml or a path named there
 ├── ImageError           one image cannot be used (the others go on)
+│   └── UnreadableImageError   its file cannot be read, whatever is in it
 ├── SceneError           a scene as a whole cannot be reconstructed
 └── ArtifactError        a file that a stage reads is missing, damaged or of another version
 
@@ -20,6 +21,10 @@ class ConfigError(SnakesfmError):
 
 class ImageError(SnakesfmError):
     """An image that cannot be read or used."""
+
+
+class UnreadableImageError(ImageError):
+    """An image whose file is missing or that the system cannot read, now at least."""
 
 
 class SceneError(SnakesfmError):

@@ -15,6 +15,7 @@ from typing import Any
 from snakesfm import slurm
 from snakesfm.errors import ConfigError
 from snakesfm.job_logs import find_cost
+from snakesfm.model_files import without_pictures
 from snakesfm.plan import Plan
 from snakesfm.records import MAKES_PART, forget, unrecorded_files, was_made_with
 from snakesfm.scene_plan import ScenePlan
@@ -38,7 +39,8 @@ class Run:
         """Set aside what other images, options or seeds made and Snakemake knows nothing of.
 
         Before the jobs are planned, so that they are planned to be made again. What does not say of itself
-        how it was made, as a model or a report, is made again and stays until then.
+        how it was made, as a model or a report, is made again and stays until then; so is a model beside
+        which pictures are lost.
 
         Parameters
         ----------
@@ -50,7 +52,9 @@ class Run:
         """
         with self._beside_no_other():
             for scene in self.plan.scenes.values():
-                for path in unrecorded_files(() if asked & MAKES_PART else scene.results(asked)):
+                results = () if asked & MAKES_PART else scene.results(asked)
+                exporting = scene.options("export_model").model_dump(include={"link_images", "undistort"})
+                for path in [*unrecorded_files(results), *without_pictures(results, **exporting)]:
                     with contextlib.suppress(OSError):
                         forget(path)
                 unknown = unrecorded_files(scene.artifacts())
@@ -216,9 +220,10 @@ class Run:
             if log.stat().st_mtime < self.started:
                 continue
             lines = log.read_text("utf-8", errors="replace").splitlines()
+            # one that is killed before its first line leaves an empty log
             if lines and lines[-1].startswith("error: "):
                 sentences.append(f"{lines[-1].removeprefix('error: ')} (log: {log})")
-            elif lines and not find_cost(lines[-1]):
+            elif not lines or not find_cost(lines[-1]):
                 sentences.append(
                     f"{log.parent.name} {log.stem} was killed from outside (out of memory, time limit, "
                     f"cancelled, or its node failed) (log: {log})"

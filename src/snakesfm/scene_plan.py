@@ -25,7 +25,8 @@ from snakesfm.front_ends import (
 )
 from snakesfm.geometry.detector_sides import LONGER_SIDE, SHORTER_SIDE
 from snakesfm.hloc_files import FEATURES, MATCHES, PAIRS
-from snakesfm.ingest.discover import count_images, fingerprint_images
+from snakesfm.ingest.discover import MASK_DIGESTS_NAME, count_images, fingerprint_images
+from snakesfm.model_files import MODEL_FILES
 from snakesfm.pair_lists import estimate_pair_count, find_pair_list, pair_list_state
 from snakesfm.resources import Load, job_load
 
@@ -247,7 +248,9 @@ class ScenePlan:
 
     def final_files(self) -> list[str]:
         """What a person looks at: the scene's model, its metrics and its report."""
-        names = ("export_model/summary.json", "evaluate_model/metrics.json", "render_report/index.html")
+        # a lost file is made again only if it is asked for
+        names = [f"export_model/{name}" for name in MODEL_FILES]
+        names += ["evaluate_model/metrics.json", "evaluate_model/metrics.csv", "render_report/index.html"]
         return [str(self.folder / name) for name in names]
 
     def database_file(self) -> str:
@@ -303,7 +306,7 @@ class ScenePlan:
 
     @functools.cached_property
     def _mask_fingerprint(self) -> str:
-        return fingerprint_images(self.masks, self.folder / "index_images" / "mask_digests.json")
+        return fingerprint_images(self.masks, self.folder / "index_images" / MASK_DIGESTS_NAME)
 
     def settings(self, stage: str, wildcards: Mapping[str, str], main_process: bool) -> dict[str, Any]:
         """What a stage is told beside its options."""

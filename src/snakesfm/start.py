@@ -21,6 +21,7 @@ def start_job(stage: str) -> None:
     ----------
     stage : verb_noun name of the stage.
     """
+    _open_standard_streams()
     status = fork_job(stage)
     if status is not None:
         sys.exit(status)
@@ -28,6 +29,21 @@ def start_job(stage: str) -> None:
     from snakesfm.job import run_job
 
     run_job(stage)
+
+
+def _open_standard_streams() -> None:
+    """Open the null device as each standard stream that whoever started the run had closed.
+
+    Otherwise the next file that is opened gets the number of the stream, and what is printed.
+    """
+    for number, name in enumerate(("stdin", "stdout", "stderr")):
+        try:
+            os.fstat(number)
+        except OSError:
+            # the lowest free number, which is this one
+            os.set_inheritable(os.open(os.devnull, os.O_RDWR), True)
+        if number and getattr(sys, name) is None:
+            setattr(sys, name, os.fdopen(number, "w", buffering=1, encoding="utf-8", closefd=False))
 
 
 def fork_job(stage: str) -> int | None:

@@ -9,6 +9,7 @@ import pytest
 
 from snakesfm.errors import ConfigError
 from snakesfm.job_logs import describe_cost
+from snakesfm.model_files import MODEL_FILES
 from snakesfm.plan import Plan
 from snakesfm.run import LOCK_NAME, Run
 
@@ -36,6 +37,9 @@ def run(plan: Plan) -> Iterator[Run]:
     started.lock.close()
 
 
+LOOKED_AT = {Path(name).name for name in MODEL_FILES} | {"metrics.json", "metrics.csv", "index.html"}
+
+
 def write(path: str | Path, text: str = "") -> Path:
     Path(path).parent.mkdir(parents=True, exist_ok=True)
     Path(path).write_text(text)
@@ -45,10 +49,10 @@ def write(path: str | Path, text: str = "") -> Path:
 @pytest.mark.parametrize(
     ("asked", "forgotten"),
     [
-        ({"out"}, {"summary.json", "metrics.json", "index.html"}),
+        ({"out"}, LOOKED_AT),
         ({"databases"}, {"database.db"}),
         ({"hloc"}, {"features.h5", "matches.h5", "pairs.txt"}),
-        ({"databases", "all"}, {"database.db", "summary.json", "metrics.json", "index.html"}),
+        ({"databases", "all"}, {"database.db"} | LOOKED_AT),
         ({"--until", "match_pairs"}, set()),
         ({"-U", "match_pairs"}, set()),
         ({"--omit-from", "export_model"}, set()),

@@ -1,5 +1,6 @@
 """What a run says of its results in the end, where it was ended before or was to make others."""
 
+import os
 import re
 import subprocess
 import sys
@@ -7,6 +8,10 @@ from pathlib import Path
 
 import pytest
 from workflow_runner import Workflow, copy_run, model_bytes
+
+from snakesfm.plan import Plan
+from snakesfm.run import Run
+from snakesfm.start import NO_SERVER, VARIABLE
 
 pytestmark = pytest.mark.workflow
 
@@ -59,6 +64,50 @@ def test_a_controller_that_gets_term_while_it_deals_with_ended_jobs_ends(
     assert again.status == 0, again.text
     assert "16 of 16 images registered" in again.summary[-1]
     assert model_bytes(workflow.folder / "out" / "square") == model_bytes(finished[0])
+
+
+@pytest.mark.parametrize("closed", ["1", "2"])
+@pytest.mark.parametrize("server", ["", NO_SERVER])
+def test_a_run_without_a_standard_stream_ends_well_and_has_its_logs(
+    finished, small_scene: Path, workflow: Workflow, closed: str, server: str
+) -> None:
+    copy_run(finished[0], workflow.folder)
+    output = workflow.folder / "out" / "square"
+    (output / "evaluate_model" / "metrics.json").unlink()
+    log = output / "logs" / "evaluate_model" / "job.log"
+    before = log.read_text()
+    command = workflow.command(*config_of(small_scene))
+    environment = {name: value for name, value in os.environ.items() if name != VARIABLE}
+    environment |= {VARIABLE: server} if server else {}
+    ended = subprocess.run(
+        ["bash", "-c", f'"$@" {closed}>&-', "bash", *command],
+        cwd=workflow.folder,
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+    assert ended.returncode == 0 and "Traceback" not in ended.stdout, ended.stdout
+    assert (output / "evaluate_model" / "metrics.json").is_file()
+    lines = log.read_text().splitlines()
+    assert lines != before.splitlines()
+    assert [lines[place].split()[1] for place in (0, -1)] == ["evaluate_model"] * 2
+
+
+def test_a_job_that_was_killed_before_its_first_line_is_named(
+    finished, small_scene: Path, workflow: Workflow
+) -> None:
+    copy_run(finished[0], workflow.folder)
+    plan = Plan({"output": str(workflow.folder / "out"), "images": str(small_scene / "images")})
+    scene, run = plan.scenes["square"], Run(plan)
+    assert run.failures(scene) == []
+    log = workflow.folder / "out" / "square" / "logs" / "match_pairs" / "0-0.log"
+    log.write_bytes(b"")
+    os.utime(log, (run.started + 1, run.started + 1))
+    (sentence,) = run.failures(scene)
+    assert sentence.startswith("match_pairs 0-0 was killed from outside") and str(log) in sentence
 
 
 @pytest.mark.parametrize(

@@ -119,6 +119,32 @@ def test_a_deleted_tile_is_made_again_with_what_depends_on_it_alone(
     assert re.search(r"([1-9]\d*) pairs \(\1 taken over\)", log)
 
 
+def test_a_lost_model_or_table_or_link_to_the_images_is_made_again(
+    finished, small_scene: Path, workflow
+) -> None:
+    copy_run(finished[0], workflow.folder)
+    output = workflow.folder / "out" / "square"
+    shutil.rmtree(output / "export_model" / "sparse")
+    (output / "evaluate_model" / "metrics.csv").unlink()
+    outcome = workflow.run(*config_of(small_scene))
+    assert outcome.status == 0, outcome.text
+    assert sorted(outcome.rules) == ["evaluate_model", "export_model", "render_report"]
+    assert model_bytes(output) == model_bytes(finished[0])
+    assert (output / "evaluate_model" / "metrics.csv").is_file()
+    # moved to another depth, a relative link leads nowhere
+    moved = Workflow(workflow.folder / "deep" / "er")
+    moved.folder.mkdir(parents=True)
+    for name in ("out", ".snakemake"):
+        (workflow.folder / name).rename(moved.folder / name)
+    images = moved.folder / "out" / "square" / "export_model" / "images"
+    assert not images.exists()
+    again = moved.run(*config_of(small_scene))
+    assert again.status == 0, again.text
+    assert sorted(again.rules) == ["export_model", "render_report"]
+    assert images.resolve() == (small_scene / "images").resolve()
+    assert moved.run(*config_of(small_scene)).rules == []
+
+
 def test_an_option_reaches_its_stage_and_what_follows_alone(finished, small_scene: Path, workflow) -> None:
     copy_run(finished[0], workflow.folder)
     outcome = workflow.run("--dry-run", *config_of(small_scene), "adjust_bundle={max_iterations: 77}")
@@ -134,6 +160,7 @@ def test_masked_parts_of_images_take_no_part(finished, small_scene: Path, workfl
         mask = np.full((300, 400), 255, np.uint8)
         mask[:, 200:] = 0
         cv2.imwrite(str(masks / f"{name}.png"), mask)
+    output = workflow.folder / "out" / "square"
     outcome = workflow.run(*config_of(small_scene), "masks=masks")
     assert outcome.status == 0, outcome.text
     assert "index_images" not in outcome.rules and "extract_features" in outcome.rules
@@ -146,6 +173,20 @@ def test_masked_parts_of_images_take_no_part(finished, small_scene: Path, workfl
     assert re.search(r"(\d+) images \(\d taken over\), \d+ of them with masks", log)
     again = workflow.run(*config_of(small_scene), "masks=masks")
     assert again.status == 0 and again.rules == [], again.text
+    # they are told by content where there is no record, too
+    for changed, made in ((False, 0), (True, len(list((output / "extract_features").glob("*.h5"))))):
+        shutil.rmtree(workflow.folder / ".snakemake")
+        if changed:
+            cv2.imwrite(str(masks / f"{names[0]}.png"), mask[:, ::-1])
+        unrecorded = workflow.run("--until", "extract_features", *config_of(small_scene), "masks=masks")
+        assert unrecorded.status == 0, unrecorded.text
+        assert unrecorded.rules.count("extract_features") == made
+        assert len(list(output.rglob("*.refused"))) == made
+        assert unrecorded.rules.count("index_images") == 0
+    features = [LocalFeatures.read(path) for path in (output / "extract_features").glob("*.h5")]
+    (first,) = [part for part in features if names[0] in part.names]
+    row = list(first.names).index(names[0])
+    assert first.keypoints[first.offsets[row] : first.offsets[row + 1], 0].min() >= 200
 
 
 def test_a_folder_without_records_is_taken_over_unless_its_options_differ(

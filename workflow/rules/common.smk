@@ -13,6 +13,7 @@ from snakesfm.errors import SnakesfmError
 from snakesfm.blocks import tile_names
 from snakesfm.config.configuration import SCENE_PATTERN, check_spelling
 from snakesfm.job_server import JobServer
+from snakesfm.model_files import MODEL_FILES
 from snakesfm.plan import Plan
 from snakesfm.records import check_folder, makes_nothing, split_words
 from snakesfm.rule_settings import check_named_together, share_resources

@@ -60,15 +60,7 @@ rule export_model:
         features=of_scene(rule_inputs.exported_keypoints),
         reconstruction=artifact("adjust_bundle", "reconstruction.h5"),
     output:
-        artifact("export_model", "sparse/0/cameras.bin"),
-        artifact("export_model", "sparse/0/images.bin"),
-        artifact("export_model", "sparse/0/points3D.bin"),
-        artifact("export_model", "sparse/0/cameras.txt"),
-        artifact("export_model", "sparse/0/images.txt"),
-        artifact("export_model", "sparse/0/points3D.txt"),
-        artifact("export_model", "points.ply"),
-        artifact("export_model", "transforms.json"),
-        artifact("export_model", "summary.json"),
+        [artifact("export_model", name) for name in MODEL_FILES],
     log:
         log_file("export_model"),
     resources:

@@ -3,15 +3,17 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from pathlib import Path
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 
 from snakesfm.arrays import Array
 from snakesfm.bundle.alignment import AlignmentSettings, GrayImage
-from snakesfm.errors import ImageError
 from snakesfm.geometry.detector_sides import USUAL_SIDE_PX
+
+if TYPE_CHECKING:
+    from snakesfm.ingest.read import ImagePixels
 
 HELD_PIXELS = 256 * USUAL_SIDE_PX * (USUAL_SIDE_PX * 3 // 2)
 """Gray values that are kept, as each image is read twice: those of so many photographs of usual size."""
@@ -42,7 +44,7 @@ class ImageSource:
 
 
 def open_image_sources(
-    paths: Sequence[Path],
+    read_image: "Callable[[int, int], ImagePixels | None]",
     sizes: Array,
     detector_scales: Array,
     finenesses: Sequence[float],
@@ -52,7 +54,7 @@ def open_image_sources(
 
     Parameters
     ----------
-    paths : files of the images.
+    read_image : gives the image of a row, its shorter side at least so many pixels if it has them; or None.
     sizes : (N,2) their widths and heights in original pixels.
     detector_scales : (N,) how many original pixels a detector pixel of each is wide.
     finenesses : how much smaller than the detector's the pixels are, ascending; those that the images are
@@ -60,21 +62,21 @@ def open_image_sources(
     settings : radius of the patches in pixels of the detector; the finer images have larger ones.
     """
     sources: list[ImageSource] = []
-    before = np.ones(len(paths))
+    before = np.ones(len(sizes))
     for fineness in finenesses:
         reductions = np.maximum(1.0, detector_scales / fineness)
-        gain = float(np.median(before / reductions)) if len(paths) else 1.0
+        gain = float(np.median(before / reductions)) if len(sizes) else 1.0
         if sources and gain < LEAST_GAIN:
             break
-        finer = float(np.median(detector_scales / reductions)) if len(paths) else 1.0
+        finer = float(np.median(detector_scales / reductions)) if len(sizes) else 1.0
         patches = replace(settings, radius_px=round(settings.radius_px * finer**RADIUS_GROWTH))
-        sources.append(_open_source(paths, sizes, detector_scales, reductions, patches))
+        sources.append(_open_source(read_image, sizes, detector_scales, reductions, patches))
         before = reductions
     return sources
 
 
 def _open_source(
-    paths: Sequence[Path],
+    read_image: "Callable[[int, int], ImagePixels | None]",
     sizes: Array,
     detector_scales: Array,
     reductions: Array,
@@ -82,19 +84,17 @@ def _open_source(
 ) -> ImageSource:
     """The images scaled down by ``reductions`` (N,)."""
     # not needed where keypoints are not refined
-    from snakesfm.ingest.read import read_image, scale_down
+    from snakesfm.ingest.read import scale_down
 
     shorter_sides = np.rint(sizes.min(axis=1) / reductions).astype(int).tolist()
-    pixels = float(np.median(sizes.prod(axis=1) / reductions**2)) if len(paths) else 1.0
+    pixels = float(np.median(sizes.prod(axis=1) / reductions**2)) if len(sizes) else 1.0
     # the images are worked on side by side
     cv2.setNumThreads(1)
 
     @lru_cache(maxsize=max(2 * settings.threads, int(HELD_PIXELS / pixels)))
     def read_gray(row: int) -> GrayImage | None:
-        try:
-            image = read_image(paths[row], shorter_sides[row])
-        except ImageError as error:
-            print(f"warning: {error}")
+        image = read_image(row, shorter_sides[row])
+        if image is None:
             return None
         gray = scale_down(image.gray, shorter_sides[row])
         scale = image.reduction * np.array(image.gray.shape[::-1]) / np.array(gray.shape[::-1])

@@ -21,6 +21,7 @@ UNREAD_SUFFIXES = (
     *(".avif", ".heic", ".heif", ".jxl"),
     *(".arw", ".cr2", ".cr3", ".dng", ".nef", ".orf", ".raf", ".rw2"),
 )
+MASK_DIGESTS_NAME = "mask_digests.json"
 CACHE_VERSION = 2
 # a file that was written so shortly before may change again within one tick of the file system's clock
 SETTLED_NS = 2_000_000_000

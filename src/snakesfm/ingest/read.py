@@ -5,13 +5,17 @@ nerfstudio load the linked images in just this way (pycolmap.Bitmap and PIL igno
 belong to the sensor's own grid, and portrait and landscape photographs of one camera share them.
 """
 
+import errno
+import hashlib
 import mmap
+import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
+from io import BytesIO
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import cv2
 import numpy as np
@@ -28,7 +32,7 @@ from PIL import (
 )
 
 from snakesfm.arrays import Array
-from snakesfm.errors import ImageError
+from snakesfm.errors import ImageError, SceneError, UnreadableImageError
 from snakesfm.ingest.exif import Exif, read_exif
 
 # a JPEG that holds several pictures is opened as JPEG and then calls itself MPO
@@ -46,6 +50,8 @@ UNDO_TURN: dict[int, Callable[[Array], Array]] = {
     7: lambda pixels: np.rot90(pixels, 2).swapaxes(0, 1),
     8: partial(np.rot90, k=3),
 }
+# as PIL's decoders say it, in an OSError
+PIL_OUT_OF_MEMORY = "out of memory"
 # what stands for no value in pictures of floating-point numbers
 NO_VALUES = (-9999.0, -32767.0, -32768.0)
 # fewer of the 256 gray levels leave a picture without detail
@@ -82,15 +88,25 @@ def read_header(path: Path | str) -> ImageHeader:
 
     Raises
     ------
-    ImageError : the file is missing, empty, no image, cut off, or its image is too small or too large.
+    UnreadableImageError : the file is missing, or the system cannot read it.
+    ImageError : it is empty, no image, cut off, or its image is too small or too large.
     """
-    with _open(path) as image:
-        _check_end(Path(path), image)
-        width, height = _stored_size(image)
-        return ImageHeader(width, height, read_exif(image))
+    path = Path(path)
+    try:
+        with path.open("rb") as file:
+            _check_not_empty(path, os.fstat(file.fileno()).st_size)
+            with (
+                mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data,
+                _open(path, file) as image,
+            ):
+                _check_end(path, image, data)
+                width, height = _stored_size(image)
+                return ImageHeader(width, height, read_exif(image))
+    except OSError as error:
+        raise _unreadable(path, error) from None
 
 
-def read_image(path: Path | str, shorter_side_px: int | None = None) -> ImagePixels:
+def read_image(path: Path | str, shorter_side_px: int | None = None, sha256: str = "") -> ImagePixels:
     """Read the pixels as stored, whatever the file's colour space and depth.
 
     Deeper than 8 bit: the brightest value decides which bits are kept, so 12-bit data in a 16-bit file is
@@ -101,15 +117,19 @@ def read_image(path: Path | str, shorter_side_px: int | None = None) -> ImagePix
     path : the file.
     shorter_side_px : a large JPEG may be decoded at 1/2, 1/4 or 1/8, as long as its shorter side stays at
         least this; that takes a fraction of the time. None for full size.
+    sha256 : what the index of images says of the file, hexadecimal; "" where nothing is known of it.
 
     Raises
     ------
     ImageError : as :func:`read_header`, or the pixels cannot be decoded to the last.
+    SceneError : the file's SHA-256 is another than ``sha256``, or the system cannot read the file now.
     """
-    with _decoding(path) as image:
+    path = Path(path)
+    data = _read_bytes(path, sha256)
+    with _decoding(path, data) as image:
         if image.format in ("JPEG", "MPO") and image.mode in ("RGB", "L"):
-            return _decode_jpeg(Path(path), min(image.size), shorter_side_px)
-        values = _decode_stored(Path(path), image)
+            return _decode_jpeg(data, min(image.size), shorter_side_px)
+        values = _decode_stored(data, image)
         if values.dtype != np.uint8:
             values = _to_8_bit(values)
         return _from_gray(values) if values.ndim == 2 else _from_rgb(values)
@@ -124,8 +144,9 @@ def read_not_black(path: Path | str) -> Array:
     ------
     ImageError : as :func:`read_image`.
     """
-    with _decoding(path) as image:
-        lit = _decode_stored(Path(path), image) > 0
+    data = _read_bytes(Path(path), "")
+    with _decoding(Path(path), data) as image:
+        lit = _decode_stored(data, image) > 0
         return np.asarray(lit if lit.ndim == 2 else lit.any(axis=2))
 
 
@@ -140,29 +161,59 @@ def scale_down(pixels: Array, shorter_side_px: int) -> Array:
     return small
 
 
-def _open(path: Path | str) -> Image.Image:
-    path = Path(path)
-    # as in read_image, the last except takes whatever PIL raises
+def _read_bytes(path: Path, sha256: str) -> bytes:
+    """The content of a file, which has this SHA-256 if one is known."""
     try:
-        if path.is_dir():
-            raise ImageError(f"{path} is a folder, not an image: rename or remove it.")
-        if path.stat().st_size == 0:
-            raise ImageError(f"{path} is empty: replace it by an intact copy or remove it.")
-        image = Image.open(path, formats=FORMATS)
-    except FileNotFoundError:
-        raise ImageError(f"{path} does not exist or is a broken link: restore or remove it.") from None
+        data = path.read_bytes()
+    except OSError as error:
+        if not sha256:
+            raise _unreadable(path, error) from None
+        raise SceneError(
+            f"{path} could not be read ({error.strerror}), though it could when the images were indexed: "
+            "start the same command again."
+        ) from None
+    if sha256 and hashlib.sha256(data).hexdigest() != sha256:
+        raise SceneError(f"{path} was changed after the images were indexed: start the same command again.")
+    _check_not_empty(path, len(data))
+    return data
+
+
+def _check_not_empty(path: Path, size: int) -> None:
+    if size == 0:
+        raise ImageError(f"{path} is empty: replace it by an intact copy or remove it.")
+
+
+def _unreadable(path: Path, error: OSError) -> UnreadableImageError:
+    """What the system's refusal to read a file means for its user."""
+    if isinstance(error, IsADirectoryError):
+        return UnreadableImageError(f"{path} is a folder, not an image: rename or remove it.")
+    if isinstance(error, FileNotFoundError) or error.errno == errno.ELOOP:
+        return UnreadableImageError(f"{path} does not exist or is a broken link: restore or remove it.")
+    if isinstance(error, PermissionError):
+        return UnreadableImageError(f"{path} cannot be read: correct its permissions or remove it.")
+    return UnreadableImageError(f"{path} cannot be read ({error.strerror or error}): restore or remove it.")
+
+
+def _damaged(path: Path, error: Exception) -> Exception:
+    """What an error of PIL or OpenCV means; too little memory for a file says nothing of the file."""
+    no_room = isinstance(error, cv2.error) and error.code == cv2.Error.StsNoMem
+    if isinstance(error, MemoryError) or no_room or PIL_OUT_OF_MEMORY in str(error):
+        return MemoryError(f"{path}: {error}")
+    return ImageError(f"{path} is damaged ({error}): replace it by an intact copy or remove it.")
+
+
+def _open(path: Path, file: BinaryIO) -> Image.Image:
+    # as in _decoding, the last except takes whatever PIL raises
+    try:
+        image = Image.open(file, formats=FORMATS)
     except UnidentifiedImageError:
         raise ImageError(
             f"{path} is not a JPEG, PNG, TIFF, WebP or BMP image: convert it to one of these or remove it."
         ) from None
-    except ImageError:
-        raise
-    except PermissionError:
-        raise ImageError(f"{path} cannot be read: correct its permissions or remove it.") from None
     except Exception as error:
-        raise ImageError(
-            f"{path} is damaged ({error}): replace it by an intact copy or remove it."
-        ) from error
+        if isinstance(error, OSError) and error.errno:
+            raise
+        raise _damaged(path, error) from error
     width, height = image.size
     if min(width, height) < MINIMUM_SIDE_PX:
         image.close()
@@ -176,35 +227,32 @@ def _open(path: Path | str) -> Image.Image:
 
 
 @contextmanager
-def _decoding(path: Path | str) -> Iterator[Image.Image]:
-    """The opened and checked image; what goes wrong with it is an ImageError."""
-    with _open(path) as image:
-        _check_end(Path(path), image)
+def _decoding(path: Path, data: bytes) -> Iterator[Image.Image]:
+    """The checked image in a file's content; what goes wrong with it is an ImageError."""
+    with _open(path, BytesIO(data)) as image:
+        _check_end(path, image, data)
         try:
             yield image
         # PIL raises errors of every type on damaged files, and one bad image must not stop the others
         except Exception as error:
-            raise ImageError(
-                f"{path} is damaged ({error}): replace it by an intact copy or remove it."
-            ) from error
+            raise _damaged(path, error) from error
 
 
-def _check_end(path: Path, image: Image.Image) -> None:
+def _check_end(path: Path, image: Image.Image, data: bytes | mmap.mmap) -> None:
     complete = True
-    with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
-        if image.format in ("JPEG", "MPO"):
-            complete = _jpeg_is_complete(data)
-        elif image.format == "PNG":
-            complete = data.rfind(b"IEND") >= 0
-        elif image.format == "WEBP":
-            complete = len(data) >= 8 + int.from_bytes(data[4:8], "little")
-        elif image.format == "TIFF":
-            complete = _tiff_is_complete(image, len(data))
+    if image.format in ("JPEG", "MPO"):
+        complete = _jpeg_is_complete(data)
+    elif image.format == "PNG":
+        complete = data.rfind(b"IEND") >= 0
+    elif image.format == "WEBP":
+        complete = len(data) >= 8 + int.from_bytes(data[4:8], "little")
+    elif image.format == "TIFF":
+        complete = _tiff_is_complete(image, len(data))
     if not complete:
         raise ImageError(f"{path} is truncated: replace it by an intact copy or remove it.")
 
 
-def _jpeg_is_complete(data: mmap.mmap) -> bool:
+def _jpeg_is_complete(data: bytes | mmap.mmap) -> bool:
     """Whether an end marker follows the start of the scan; a thumbnail in the header has its own."""
     if data[-2:] == b"\xff\xd9":
         return True
@@ -243,7 +291,7 @@ def _stored_size(image: Image.Image) -> tuple[int, int]:
     return int(width), int(tags.get(ExifTags.Base.ImageLength, image.height))
 
 
-def _decode_jpeg(path: Path, side: int, shorter_side_px: int | None) -> ImagePixels:
+def _decode_jpeg(data: bytes, side: int, shorter_side_px: int | None) -> ImagePixels:
     """Decode an 8-bit gray or colour JPEG with OpenCV: PIL's very pixels, with a copy less."""
     reduction = 1
     while shorter_side_px and reduction < 8 and side // (2 * reduction) >= shorter_side_px:
@@ -254,13 +302,12 @@ def _decode_jpeg(path: Path, side: int, shorter_side_px: int | None) -> ImagePix
         4: cv2.IMREAD_REDUCED_COLOR_4,
         8: cv2.IMREAD_REDUCED_COLOR_8,
     }[reduction]
-    return _from_rgb(cv2.cvtColor(_decode(path, flags), cv2.COLOR_BGR2RGB), reduction)
+    return _from_rgb(cv2.cvtColor(_decode(data, flags), cv2.COLOR_BGR2RGB), reduction)
 
 
-def _decode(path: Path, flags: int) -> Array:
+def _decode(data: bytes, flags: int) -> Array:
     """Colours (H,W,3) or (H,W,4) in OpenCV's order, turned where a TIFF file asks for it."""
-    data = np.frombuffer(path.read_bytes(), np.uint8)
-    colours = cv2.imdecode(data, flags | cv2.IMREAD_IGNORE_ORIENTATION)
+    colours = cv2.imdecode(np.frombuffer(data, np.uint8), flags | cv2.IMREAD_IGNORE_ORIENTATION)
     if colours is None:
         raise ValueError("it cannot be decoded")
     return np.asarray(colours)
@@ -273,7 +320,7 @@ def _layout_of_deep_colours(image: Image.Image) -> str:
     return next((str(tile[3]) for tile in image.tile if ";16" in str(tile[3])), "")
 
 
-def _decode_stored(path: Path, image: Image.Image) -> Array:
+def _decode_stored(data: bytes, image: Image.Image) -> Array:
     """Gray (H,W) or colours (H,W,3) of an opened image in the file's depth, alpha composed over black."""
     turn_back = UNDO_TURN.get(_tiff_orientation(image))
     # loading drops what tells the depth, but no damage passes it
@@ -281,13 +328,13 @@ def _decode_stored(path: Path, image: Image.Image) -> Array:
     # colours of RGBa are multiplied by alpha already
     transparent = image.has_transparency_data and "RGBa" not in layout
     image.load()
-    values = _decode_deep(path, transparent) if layout else _decoded_values(image)
+    values = _decode_deep(data, transparent) if layout else _decoded_values(image)
     return values if turn_back is None else np.ascontiguousarray(turn_back(values))
 
 
-def _decode_deep(path: Path, transparent: bool) -> Array:
+def _decode_deep(data: bytes, transparent: bool) -> Array:
     """Colours (H,W,3) of 16 bits, turned as PIL turns them; ``transparent``: over black."""
-    colours = _decode(path, cv2.IMREAD_UNCHANGED)
+    colours = _decode(data, cv2.IMREAD_UNCHANGED)
     rgb = colours[..., 2::-1]
     if transparent:
         rgb = rgb.astype(np.uint32) * colours[..., 3:] // np.iinfo(colours.dtype).max

@@ -55,7 +55,8 @@ def run(job: StageJob) -> None:
 
     Raises
     ------
-    SceneError : fewer than two images are left.
+    SceneError : fewer than two images are left, or one cannot be read now or is another than when it was
+        indexed.
     """
     index = ImageIndex.read(job.path("index"))
     originals = cameras_from_columns(*CalibratedCameras.read(job.path("cameras")).camera_columns)
@@ -216,10 +217,12 @@ def _usable_pairs(graph: ViewGraph, poses: BundleModel) -> np.ndarray:
 
 def _image_sources(job: StageJob, index: ImageIndex) -> list[ImageSource]:
     """The images in gray at the sizes at which keypoints are refined."""
+    # not needed where keypoints are not refined
+    from snakesfm.ingest.indexed import IndexedImages
+
     options: AdjustBundleOptions = job.options
-    folder = Path(job.settings["images"])
     return open_image_sources(
-        [folder / str(name) for name in index.names],
+        IndexedImages(index.names, index.sha256, Path(job.settings["images"])).read,
         index.sizes,
         detector_scales(index.sizes, job.settings),
         options.refine_finenesses,

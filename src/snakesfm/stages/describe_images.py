@@ -9,7 +9,6 @@ import numpy as np
 from snakesfm.arrays import Array
 from snakesfm.artifacts.features import GlobalDescriptors, LocalFeatures, Vocabulary
 from snakesfm.artifacts.images import ImageIndex
-from snakesfm.errors import ImageError
 from snakesfm.learned.batches import in_batches
 from snakesfm.retrieval.codebook import largest_rows
 from snakesfm.retrieval.descriptor import DESCRIPTORS, describe_batch
@@ -21,7 +20,12 @@ if TYPE_CHECKING:
 
 
 def run(job: StageJob) -> None:
-    """Describe the images and write their GlobalDescriptors."""
+    """Describe the images and write their GlobalDescriptors.
+
+    Raises
+    ------
+    SceneError : an image cannot be read now, or is another than when it was indexed.
+    """
     options: DescribeImagesOptions = job.options
     describe = _describe_local_features if options.method == "vlad" else _describe_pictures
     image_ids, described = describe(job, options)
@@ -46,14 +50,14 @@ def _describe_local_features(job: StageJob, options: "DescribeImagesOptions") ->
 
 def _describe_pictures(job: StageJob, options: "DescribeImagesOptions") -> tuple[Array, Array]:
     """The same from the images themselves; one that cannot be decoded resembles none."""
-    from snakesfm.ingest.read import read_image
+    from snakesfm.ingest.indexed import IndexedImages
 
     index = ImageIndex.read(job.paths("index")[0])
     image_ids = np.flatnonzero(index.blocks == int(job.settings["block"]))
     descriptor = DESCRIPTORS[options.method](state=job.read_weights(options.method))
     side = descriptor.usual_side_px if options.longer_side_px == "auto" else options.longer_side_px
     described = np.zeros((len(image_ids), descriptor.size), np.float32)
-    unread = []
+    images = IndexedImages(index.names, index.sha256, Path(job.settings["images"]))
     progress = job.progress(len(image_ids), "images")
     for rows in in_batches([tuple(size) for size in index.sizes[image_ids].tolist()], job.network_batch()):
         pictures = {}
@@ -62,16 +66,14 @@ def _describe_pictures(job: StageJob, options: "DescribeImagesOptions") -> tuple
             width, height = index.sizes[image].tolist()
             shorter = math.ceil(side * min(width, height) / max(width, height))
             shorter = max(shorter, descriptor.smallest_side_px)
-            try:
-                pixels = read_image(Path(job.settings["images"]) / str(index.names[image]), shorter)
+            pixels = images.read(image, shorter)
+            if pixels is not None:
                 pictures[row] = pixels.rgb
-            except ImageError as error:
-                print(f"warning: {error}")
-                unread.append(error)
         described[list(pictures)] = describe_batch(descriptor, list(pictures.values()), side)
         progress.step(len(rows))
-    if unread:
+    if images.damaged:
         job.warn(
-            f"{len(unread)} of {len(image_ids)} images cannot be read and so resemble no other: {unread[0]}"
+            f"{len(images.damaged)} of {len(image_ids)} images cannot be read and so resemble no other: "
+            f"{next(iter(images.damaged.values()))}"
         )
     return image_ids.astype(np.int32), described

@@ -19,12 +19,14 @@ from snakesfm.artifacts.hloc import (
 )
 from snakesfm.artifacts.images import ImageIndex
 from snakesfm.digests import file_digest
-from snakesfm.errors import ConfigError, ImageError
+from snakesfm.errors import ConfigError
 from snakesfm.features.extraction import DETECTORS, extract_keypoints, sample_colors
 from snakesfm.features.keypoints import Detector, KeypointSet, KeypointSource
 from snakesfm.hloc_files import FEATURES
+from snakesfm.ingest.discover import MASK_DIGESTS_NAME, fingerprint_images
+from snakesfm.ingest.indexed import IndexedImages
 from snakesfm.ingest.masks import find_mask, read_mask
-from snakesfm.ingest.read import read_image
+from snakesfm.ingest.read import ImagePixels
 from snakesfm.learned.batches import in_batches
 from snakesfm.stages.job import StageJob
 
@@ -52,16 +54,19 @@ def run(job: StageJob) -> None:
 
     Raises
     ------
+    SceneError : an image cannot be read now, or is another than when it was indexed.
     ConfigError : a mask cannot be read, or does not show the whole of its image; hloc's file does not fit.
     """
     cv2.setNumThreads(job.threads)
     options: ExtractFeaturesOptions = job.options
     index = ImageIndex.read(job.path("index"))
     rows = np.flatnonzero(index.blocks == int(job.settings["block"]))
-    folder = Path(job.settings["images"])
+    pictures = IndexedImages(index.names, index.sha256, Path(job.settings["images"]))
     finder = _create_finder(job, options)
     beside = job.weights_digest() + str(job.settings.get("source_content", ""))
     names = [str(name) for name in index.names[rows]]
+    # before they are read, so that a mask that changes meanwhile is noticed
+    told = _told_of_masks(job)
     masks = _find_masks(job, names)
     contents = {name: file_digest(str(path)) for name, path in masks.items()}
     # known keypoints are found by the image's name
@@ -80,10 +85,11 @@ def run(job: StageJob) -> None:
         places = [missing[part] for part in batch]
         images = [(names[place], sizes[place]) for place in places]
         wanted = [read_mask(masks[name], size) if name in masks else None for name, size in images]
-        results |= zip(places, _extract(folder, images, wanted, finder, options), strict=True)
+        seen = [pictures.read(rows[place], options.max_shorter_side_px) for place in places]
+        results |= zip(places, _extract(images, seen, wanted, finder, options), strict=True)
         progress.step(len(places))
     ordered = [results[place] for place in range(len(rows))]
-    _collect(index, rows, digests, ordered, finder).write(job.output, job.header)
+    _collect(index, rows, digests, ordered, finder).write(job.output, told.header)
     counts = [len(result.points) for result in ordered]
     reused = sum(digest in former for digest in digests)
     bare = [name for name, count in zip(names, counts, strict=True) if count == 0]
@@ -105,6 +111,15 @@ def _find_masks(job: StageJob, names: Sequence[str]) -> dict[str, Path]:
         return {}
     found = {name: find_mask(Path(job.settings["masks"]), name) for name in names}
     return {name: mask for name, mask in found.items() if mask is not None}
+
+
+def _told_of_masks(job: StageJob) -> StageJob:
+    """The job with what only the controller compares: the content of all masks, if there are any."""
+    if not job.settings.get("masks"):
+        return job
+    cache_file = job.path("index").with_name(MASK_DIGESTS_NAME)
+    content = fingerprint_images(Path(job.settings["masks"]), cache_file)
+    return replace(job, settings={**job.settings, "masks_content": content})
 
 
 def _create_finder(job: StageJob, options: "ExtractFeaturesOptions") -> Detector | KeypointSource:
@@ -206,21 +221,16 @@ def _digest(sha256: str, options: "ExtractFeaturesOptions", beside: str) -> str:
 
 
 def _extract(
-    folder: Path,
     images: Sequence[tuple[str, tuple[int, int]]],
+    pictures: Sequence[ImagePixels | None],
     masks: Sequence[Array | None],
     finder: Detector | KeypointSource,
     options: "ExtractFeaturesOptions",
 ) -> list[ColoredKeypoints]:
-    """The keypoints of images, each given by its name in the folder, its width and height, and its mask."""
+    """The keypoints of images, each given by its name, its width and height, its pixels and its mask."""
     nothing = KeypointSet.empty(finder.descriptor_size, finder.descriptor_dtype)
     results = [ColoredKeypoints(nothing, np.zeros((0, 3), np.uint8))] * len(images)
-    pixels = {}
-    for place, (name, _) in enumerate(images):
-        try:
-            pixels[place] = read_image(folder / name, options.max_shorter_side_px)
-        except ImageError as error:
-            print(f"warning: {error}")
+    pixels = {place: picture for place, picture in enumerate(pictures) if picture is not None}
     most = finder.usual_keypoints if options.max_keypoints == "auto" else options.max_keypoints
     if isinstance(finder, KeypointSource):
         found = [_read_known(finder, *images[place], masks[place]) for place in pixels]

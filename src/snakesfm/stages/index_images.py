@@ -1,7 +1,7 @@
 """index_images: list the images and assign them to cameras."""
 
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -11,7 +11,7 @@ import numpy as np
 
 from snakesfm.artifacts.images import ImageIndex
 from snakesfm.blocks import deal_blocks
-from snakesfm.errors import ImageError, SceneError
+from snakesfm.errors import ImageError, SceneError, UnreadableImageError
 from snakesfm.geometry.camera import cameras_to_columns
 from snakesfm.ingest.cameras import ImageCameras, Photograph, assign_cameras, warn_of_own_cameras
 from snakesfm.ingest.discover import digest_images, fingerprint, list_photographs
@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from snakesfm.config.index_images import IndexImagesOptions
 
 DIGESTS_NAME = "digests.json"
+FLICKERS = "{path} could be read at one moment and not at another: start the same command again."
 UNREAD = "{path} has an unsupported format: convert it to JPEG."
 
 
@@ -34,14 +35,14 @@ def run(job: StageJob) -> None:
     Raises
     ------
     ConfigError : the folder cannot be listed, or the known intrinsics are wrong.
-    SceneError : fewer than two different images can be used.
+    SceneError : fewer than two different images can be used, or one could not be read each time.
     """
     options: IndexImagesOptions = job.options
     folder = Path(job.settings["images"])
     known = read_known_cameras(job.settings["cameras"]) if job.settings.get("cameras") else None
     names, unread = list_photographs(folder)
     digests = digest_images(folder, names, job.output.parent / DIGESTS_NAME, job.threads)
-    photographs, refused = _read_headers(job, folder, names)
+    photographs, refused = _read_headers(job, folder, digests)
     refused |= {name: UNREAD.format(path=folder / name) for name in unread}
     _check_scene(folder, names, {digests[p.name] for p in photographs}, refused)
     given, warnings = match_known_cameras(known, photographs) if known else ([None] * len(photographs), [])
@@ -61,8 +62,15 @@ def run(job: StageJob) -> None:
     _report(index)
 
 
-def _read_headers(job: StageJob, folder: Path, names: list[str]) -> tuple[list[Photograph], dict[str, str]]:
-    """The usable images, and the others' names with the reason in one sentence."""
+def _read_headers(
+    job: StageJob, folder: Path, digests: Mapping[str, str]
+) -> tuple[list[Photograph], dict[str, str]]:
+    """The usable images, and the others' names with the reason in one sentence.
+
+    An index that lacks an image for a moment's fault would stay, so a file that could be read for its
+    digest must be readable still, and one that could not must not be by now.
+    """
+    names = list(digests)
     progress = job.progress(len(names), "images")
 
     def read(name: str) -> Photograph | str:
@@ -71,8 +79,14 @@ def _read_headers(job: StageJob, folder: Path, names: list[str]) -> tuple[list[P
             header = read_header(folder / name)
         except UnicodeEncodeError:
             return f"The name of {folder / name!a} is not UTF-8: rename the file."
+        except UnreadableImageError as error:
+            if digests[name]:
+                raise SceneError(FLICKERS.format(path=folder / name)) from error
+            return str(error)
         except ImageError as error:
             return str(error)
+        if not digests[name]:
+            raise SceneError(FLICKERS.format(path=folder / name))
         return Photograph(name, header.width, header.height, header.exif)
 
     photographs, refused = [], {}

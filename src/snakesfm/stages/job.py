@@ -1,5 +1,6 @@
 """The inputs, outputs and options of a stage, wherever it runs."""
 
+import contextlib
 import json
 import os
 import sys
@@ -150,14 +151,26 @@ class StageJob:
         Parameters
         ----------
         digests : of all images or pairs of the output, in its order.
-        read : reads what a file holds of the wanted digests, nothing where it cannot be read.
+        read : reads what a file holds of the wanted digests; nothing is taken where it fails.
         """
         wanted = set(digests)
         taken: dict[str, Any] = {}
-        for path in (self.former, cached_path(self.stage, digests)):
+        cached = cached_path(self.stage, digests)
+        for path in (self.former, cached):
             # unlike a Path, this says no of a folder that may not be entered
-            if path is not None and os.path.isfile(path) and not wanted <= taken.keys():  # noqa: PTH113
-                taken.update(read(path, wanted))
+            if path is None or not os.path.isfile(path) or wanted <= taken.keys():  # noqa: PTH113
+                continue
+            found: Mapping[str, Any] = {}
+            try:
+                found = read(path, wanted)
+            # what h5py and numpy raise on damage has no common kind, and everything can be computed again
+            except Exception as error:
+                print(f"{path} cannot be read ({type(error).__name__}), so nothing is taken over from it")
+            taken.update(found)
+            if path == cached and not wanted <= found.keys():
+                # its name promises all of them, so it is damaged: this job shares another in its place
+                with contextlib.suppress(OSError):
+                    path.unlink()
         return taken
 
     def warn(self, sentence: str) -> None:

@@ -16,7 +16,6 @@ from snakesfm.artifacts.features import LocalFeatures
 from snakesfm.artifacts.hloc import open_hloc, read_hloc_matches
 from snakesfm.artifacts.images import ImageIndex
 from snakesfm.artifacts.pairs import ImagePairs, PairCoordinates, PairMatches
-from snakesfm.errors import ImageError
 from snakesfm.features.keypoints import KeypointSet
 from snakesfm.front_ends import DETECTOR_FREE
 from snakesfm.geometry.detector_sides import LEAST_SIDE_PX
@@ -49,6 +48,10 @@ def run(job: StageJob) -> None:
 
     Writes PairMatches, or PairCoordinates where there are no keypoints. The features (or the pictures) of
     ``HELD_IMAGES`` images and of a network's batch are held at a time, whatever the size of the blocks.
+
+    Raises
+    ------
+    SceneError : an image cannot be read now, or is another than when it was indexed.
     """
     options: MatchPairsOptions = job.options
     pairs = ImagePairs.read(job.path("pairs")).pairs
@@ -78,6 +81,9 @@ def run(job: StageJob) -> None:
                 prepared.append((first, read_second(j)))
             results |= zip(rows, _match(matcher, prepared), strict=True)
             progress.step(len(rows))
+    if isinstance(source, ImageFiles) and source.images.damaged:
+        damaged = list(source.images.damaged.values())
+        job.warn(f"{len(damaged)} images cannot be read and so match no other: {damaged[0]}")
     matches = [results[row] for row in range(len(pairs))]
     _collect(kind, pairs, digests, matches).write(job.output, job.header)
     counts = [len(rows) for rows, _ in matches]
@@ -197,26 +203,24 @@ class ImageFiles:
     """
 
     def __init__(self, job: StageJob) -> None:
+        from snakesfm.ingest.indexed import IndexedImages
+
         index = ImageIndex.read(job.paths("index")[0])
+        self.images = IndexedImages(index.names, index.sha256, Path(job.settings["images"]))
         self._names = [str(name) for name in index.names]
         self.digests = [str(digest) for digest in index.sha256]
         if job.options.method == "virtual_places":
             # the oracle knows an image by its name
             self.digests = [" ".join(both) for both in zip(self.digests, self._names, strict=True)]
         self._sizes = [(width, height) for width, height in index.sizes.tolist()]
-        self._folder = Path(job.settings["images"])
         self._side_px = int(job.options.longer_side_px)
 
     def read(self, image: int) -> Picture:
         """One image of the index, not smaller than the matcher wants it."""
-        from snakesfm.ingest.read import read_image
-
         name, size = self._names[image], self._sizes[image]
         shorter = max(math.ceil(self._side_px * min(size) / max(size)), LEAST_SIDE_PX)
-        try:
-            pixels = read_image(self._folder / name, shorter)
-        except ImageError as error:
-            print(f"warning: {error}")
+        pixels = self.images.read(image, shorter)
+        if pixels is None:
             black = np.zeros((size[1], size[0], 3), np.uint8)
             return Picture(name, size, black[..., 0], black)
         # the last column and row may go beyond the original image

@@ -11,11 +11,10 @@ from snakesfm.arrays import Array
 from snakesfm.artifacts.features import LocalFeatures
 from snakesfm.artifacts.images import ImageIndex
 from snakesfm.artifacts.pairs import PairCoordinates
-from snakesfm.errors import ImageError
 from snakesfm.features.extraction import sample_colors
 from snakesfm.geometry.detector_pixels import detector_scales, reduce_keypoints
 from snakesfm.geometry.detector_sides import USUAL_SIDE_PX
-from snakesfm.ingest.read import read_image
+from snakesfm.ingest.indexed import IndexedImages
 from snakesfm.matching.merging import merge_coordinates
 from snakesfm.stages.job import StageJob
 
@@ -27,12 +26,16 @@ def run(job: StageJob) -> None:
     """Write the LocalFeatures of the block's images, without descriptors.
 
     An image's keypoints depend on all pairs that it is in, and neither on their order nor on the blocks.
+
+    Raises
+    ------
+    SceneError : an image cannot be read now, or is another than when it was indexed.
     """
     options: MergeKeypointsOptions = job.options
     index = ImageIndex.read(job.path("index"))
     rows = np.flatnonzero(index.blocks == int(job.settings["block"]))
     found = _gather(job.paths("matches"), set(rows.tolist()))
-    folder = Path(job.settings["images"])
+    images = IndexedImages(index.names, index.sha256, Path(job.settings["images"]))
     progress = job.progress(len(rows), "images")
     # an empty set in front keeps shapes and dtypes where the block has no image
     keypoints, scores = [np.zeros((0, 2), np.float32)], [np.zeros(0, np.float32)]
@@ -44,7 +47,7 @@ def run(job: StageJob) -> None:
         merged = reduce_keypoints(merged, 1.0 / scale)
         keypoints.append(merged)
         scores.append(sure)
-        colors.append(_read_colors(folder / str(index.names[row]), merged))
+        colors.append(_read_colors(images, row, merged))
         progress.step()
     count = sum(map(len, keypoints))
     LocalFeatures(
@@ -82,14 +85,12 @@ def _gather(paths: list[Path], images: set[int]) -> Mapping[int, tuple[Array, Ar
     }
 
 
-def _read_colors(path: Path, keypoints: Array) -> Array:
-    """RGB of the image at the keypoints; black where it cannot be decoded."""
+def _read_colors(images: IndexedImages, row: int, keypoints: Array) -> Array:
+    """RGB of an image of the index at the keypoints; black where it cannot be decoded."""
     if len(keypoints) == 0:
         return np.zeros((0, 3), np.uint8)
-    try:
-        # colours need no more pixels
-        image = read_image(path, USUAL_SIDE_PX)
-    except ImageError as error:
-        print(f"warning: {error}")
+    # colours need no more pixels
+    image = images.read(row, USUAL_SIDE_PX)
+    if image is None:
         return np.zeros((len(keypoints), 3), np.uint8)
     return sample_colors(image.rgb, keypoints / image.reduction)

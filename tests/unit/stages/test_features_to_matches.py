@@ -1,7 +1,7 @@
 """From images to matches by the stages themselves, on rendered images."""
 
 import io
-from pathlib import Path
+import shutil
 
 import cv2
 import h5py
@@ -19,6 +19,7 @@ from snakesfm.artifacts import (
     Vocabulary,
 )
 from snakesfm.blocks import deal_blocks
+from snakesfm.cache import cached_path, share
 from snakesfm.config.describe_images import DescribeImagesOptions
 from snakesfm.config.extract_features import ExtractFeaturesOptions
 from snakesfm.config.learn_vocabulary import LearnVocabularyOptions
@@ -26,6 +27,8 @@ from snakesfm.config.match_pairs import MatchPairsOptions
 from snakesfm.config.select_pairs import SelectPairsOptions
 from snakesfm.errors import ConfigError
 from snakesfm.geometry.camera import PARAM_SLOTS
+from snakesfm.ingest.discover import digest_images
+from snakesfm.ingest.indexed import IndexedImages
 from snakesfm.stages import describe_images, extract_features, learn_vocabulary, match_pairs, select_pairs
 from snakesfm.stages.job import StageJob
 
@@ -70,13 +73,13 @@ class Scene:
 
     terminal = None
 
-    def __init__(self, folder, images, blocks, shas=None, gps=None, copies=()):
+    def __init__(self, folder, images, blocks, gps=None, copies=()):
         self.folder, self.images, self.blocks = folder, images, blocks
         count = len(NAMES)
         index = ImageIndex(
             names=NAMES,
             sizes=np.tile([320, 240], (count, 1)),
-            sha256=shas or [f"sha of {name}" for name in NAMES],
+            sha256=list(digest_images(images, NAMES).values()),
             blocks=deal_blocks(NAMES, blocks),
             camera_ids=np.zeros(count, int),
             orientations=np.ones(count, int),
@@ -398,16 +401,17 @@ def test_matches_are_right_and_do_not_depend_on_the_blocks(whole, dealt):
 def test_unchanged_images_and_pairs_are_taken_over(dealt, images, tmp_path, monkeypatch, capsys):
     dealt.select(SelectPairsOptions())
     before = dealt.match()
-    shas = [f"sha of {name}" for name in NAMES]
-    shas[4] = "another"
-    scene = Scene(tmp_path, images, 3, shas)
+    changed = shutil.copytree(images, tmp_path / "images")
+    with (changed / "other.png").open("ab") as file:
+        file.write(b"behind the image")
+    scene = Scene(tmp_path, changed, 3)
     read = []
-    original = extract_features.read_image
+    original = IndexedImages.read
     monkeypatch.setattr(
-        extract_features, "read_image", lambda path, side: read.append(path) or original(path, side)
+        IndexedImages, "read", lambda self, row, side: read.append(NAMES[row]) or original(self, row, side)
     )
     scene.extract(former=dealt)
-    assert [Path(path).name for path in read] == ["other.png"]
+    assert read == ["other.png"]
     scene.select(SelectPairsOptions())
     capsys.readouterr()
     after = scene.match(former=dealt)
@@ -428,6 +432,46 @@ def test_other_options_or_a_damaged_former_file_take_nothing_over(dealt, images,
     other = Scene(tmp_path / "again", images, 3)
     other.extract(former=scene)
     assert all(len(points["keypoints"]) <= 400 for points in other.features().values())
+
+
+@pytest.mark.parametrize("damage", ["columns", "attributes", "groups", "pages"])
+def test_a_damaged_former_or_shared_file_costs_time_alone(images, tmp_path, capsys, monkeypatch, damage):
+    """What h5py raises is of many kinds."""
+    monkeypatch.setenv("SNAKESFM_CACHE", str(tmp_path / "shared"))
+    scene = Scene(tmp_path, images, 1)
+    scene.extract()
+    (made,) = scene.block_files("features")
+    digests = LocalFeatures.read(made).digests
+    whole = made.read_bytes()
+    cached = cached_path("extract_features", digests)
+    former = tmp_path / "former.h5"
+    former.write_bytes(whole)
+    if damage == "pages":
+        former.write_bytes(whole[:2000] + b"\xff" * 3000 + whole[5000:])
+    else:
+        with h5py.File(former, "r+") as file:
+            if damage == "attributes":
+                file.attrs["checksum"] = "none"
+            elif damage == "columns":
+                del file["offsets"]
+                file["offsets"] = np.arange(3, dtype=float)
+            else:
+                del file["digests"]
+                file.create_group("digests")
+    cached.parent.mkdir(parents=True)
+    cached.write_bytes(former.read_bytes())
+    options = ExtractFeaturesOptions(max_keypoints=400)
+    settings = {"images": str(images), "block": 0}
+    inputs, again = {"index": scene.file("index")}, tmp_path / "again.h5"
+    capsys.readouterr()
+    extract_features.run(scene.job("extract_features", options, inputs, [again], former, **settings))
+    assert "6 images (0 taken over)" in capsys.readouterr().out
+    assert not cached.exists()
+    np.testing.assert_array_equal(LocalFeatures.read(again).keypoints, LocalFeatures.read(made).keypoints)
+    share(again, cached)
+    extract_features.run(scene.job("extract_features", options, inputs, [made], None, **settings))
+    assert "6 images (6 taken over)" in capsys.readouterr().out
+    assert cached.exists()
 
 
 def newer(kind, **options):

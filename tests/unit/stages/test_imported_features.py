@@ -28,7 +28,7 @@ def extract(tmp_path):
         for name in names:
             pixels = rng.integers(0, 255, (HEIGHT, WIDTH), dtype=np.uint8)
             cv2.imwrite(str(tmp_path / name), pixels)
-        write_plain_index(tmp_path / "index.h5", names, [(WIDTH, HEIGHT)] * len(names), names)
+        write_plain_index(tmp_path / "index.h5", names, [(WIDTH, HEIGHT)] * len(names), [""] * len(names))
         with h5py.File(tmp_path / "features.h5", "w") as file:
             for name, group in arrays.items():
                 for key, values in group.items():
