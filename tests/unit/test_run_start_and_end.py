@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from snakesfm.artifacts import Header, ImagePairs, checks, write_json
+from snakesfm.config.evaluate_model import EvaluateModelOptions
 from snakesfm.errors import ConfigError
 from snakesfm.evaluation.metrics import Poses, evaluate_poses
 from snakesfm.plan import Plan
@@ -108,7 +109,8 @@ def test_accuracy_is_said_at_the_thresholds_that_it_was_evaluated_at(
     rotations, translations = reference.rotations.copy(), -centers
     rotations[0], translations[0] = turned, turned @ translations[0]
     model = Poses(names, rotations, translations)
-    assert f", {said}, " in say_accuracy(plan, evaluate_poses(model, reference, thresholds_deg).metrics)
+    options = EvaluateModelOptions(relative_thresholds_deg=thresholds_deg).model_dump()
+    assert f", {said}, " in say_accuracy(plan, evaluate_poses(model, reference, **options).metrics)
 
 
 def test_without_a_reference_nothing_is_said_of_accuracy(plan: Plan) -> None:
