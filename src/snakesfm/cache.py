@@ -30,10 +30,17 @@ def cached_path(stage: str, digests: Iterable[str]) -> Path | None:
     return Path(folder).expanduser() / stage / name[:2] / f"{name}.h5"
 
 
-def share(path: Path, cached: Path) -> None:
-    """Put a finished file into the shared folder, complete or not at all; a link where that is possible."""
+def share(path: Path, cached: Path, replace: bool = False) -> None:
+    """Put a finished file into the shared folder, complete or not at all; a link where that is possible.
+
+    Parameters
+    ----------
+    path : the finished file.
+    cached : its place, see :func:`cached_path`.
+    replace : whether to replace a file of the same size that is there.
+    """
     try:
-        if cached.exists() and cached.stat().st_size == path.stat().st_size:
+        if not replace and cached.exists() and cached.stat().st_size == path.stat().st_size:
             return
         cached.parent.mkdir(parents=True, exist_ok=True)
         temporary = cached.with_name(f".{cached.name}.{os.uname().nodename}.{os.getpid()}")

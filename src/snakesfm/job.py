@@ -171,7 +171,7 @@ def _share(job: Any, module: Any) -> None:
         with h5py.File(job.output, "r", locking=False) as file:
             cached = cached_path(job.stage, file["digests"].asstr()[()])
         if cached is not None:
-            share(job.output, cached)
+            share(job.output, cached, replace=cached in job.distrusted)
 
 
 def _damage_behind(call: Call, error: Exception) -> Exception | None:

@@ -1,6 +1,5 @@
 """The inputs, outputs and options of a stage, wherever it runs."""
 
-import contextlib
 import json
 import os
 import sys
@@ -66,6 +65,7 @@ class StageJob:
     former : an earlier version of the output whose unchanged parts may be taken over, or None.
     batch_size : how many images or pairs a network gets at once; results never depend on it.
     terminal : where progress and warnings are said beside the log, or None.
+    distrusted : files in the shared folder that could not be read whole; the job's own replace them.
     """
 
     stage: str
@@ -79,6 +79,7 @@ class StageJob:
     former: Path | None = None
     batch_size: int | Literal["auto"] = "auto"
     terminal: TextIO | None = None
+    distrusted: set[Path] = field(default_factory=set)
 
     @property
     def output(self) -> Path:
@@ -168,9 +169,8 @@ class StageJob:
                 print(f"{path} cannot be read ({type(error).__name__}), so nothing is taken over from it")
             taken.update(found)
             if path == cached and not wanted <= found.keys():
-                # its name promises all of them, so it is damaged: this job shares another in its place
-                with contextlib.suppress(OSError):
-                    path.unlink()
+                # its name promises all of them
+                self.distrusted.add(path)
         return taken
 
     def warn(self, sentence: str) -> None:

@@ -25,6 +25,7 @@ from snakesfm.artifacts import (
 )
 from snakesfm.artifacts.pairs import EDGE_LABELS, KINDS, REJECTIONS
 from snakesfm.geometry.camera import cameras_from_columns, observation_errors
+from snakesfm.grouping import rows_of_each
 from snakesfm.job_logs import stage_costs
 from snakesfm.reporting.page import Page, render_page
 from snakesfm.reporting.plots import error_histogram, scene_map, view_axes
@@ -259,16 +260,19 @@ def _missing(
     index: ImageIndex, names: Sequence[str], counts: ImageCounts, pairs: Pairs, graph: ViewGraph
 ) -> list[list[str]]:
     rows = []
+    rejections, labels = (dict(rows_of_each(np.ravel(found.pairs))) for found in (pairs, graph))
+    nothing = np.zeros(0, np.int64)
     for image in np.flatnonzero(~counts.registered).tolist():
-        refused = pairs.rejections[(pairs.pairs == image).any(axis=1)]
-        labels = graph.labels[(graph.pairs == image).any(axis=1)]
+        # a pair stands at two places of the flat list
+        refused = pairs.rejections[rejections.get(image, nothing) // 2]
+        dropped = graph.labels[labels.get(image, nothing) // 2]
         first = int(index.duplicate_of[image])
         reason = reason_not_registered(
             image,
             counts,
             names[first] if first >= 0 else "",
             dict(label_counts(refused[refused > 0], REJECTIONS)),
-            dict(label_counts(labels[labels > 0], EDGE_LABELS)),
+            dict(label_counts(dropped[dropped > 0], EDGE_LABELS)),
         )
         rows.append([names[image], reason])
     return rows

@@ -18,10 +18,16 @@ from snakesfm.translation_averaging.problem import PositioningProblem
 FIRST_SCALE = 16.0
 IRLS_ROUNDS = 12
 IRLS_TOLERANCE = 5e-3
+# more take memory and time with the square of the tracks' length, and tell nothing new of an edge
+MANY_SHARED_RAYS = 1_000_000
+ENOUGH_SHARED_RAYS = 25
 
 
 def shared_rays(problem: PositioningProblem) -> tuple[Array, Array, Array]:
-    """Every landmark that both cameras of an edge see: edge (S), ray rows in images i (S) and j (S)."""
+    """Every landmark that both cameras of an edge see: edge (S), ray rows in images i (S) and j (S).
+
+    Of more than ``MANY_SHARED_RAYS``, as where all images see the same, each edge has some, evenly chosen.
+    """
     count = problem.image_count
     _, lengths = np.unique(problem.ray_tracks, return_counts=True)
     starts = offsets_of(lengths)[:-1]
@@ -40,11 +46,21 @@ def shared_rays(problem: PositioningProblem) -> tuple[Array, Array, Array]:
         lefts.append(left[found])
         rights.append(right[found])
     empty = np.zeros(0, dtype=np.int64)
-    return (
-        np.concatenate([empty, *edges]),
-        np.concatenate([empty, *lefts]),
-        np.concatenate([empty, *rights]),
-    )
+    shared = tuple(np.concatenate([empty, *parts]) for parts in (edges, lefts, rights))
+    kept = _thinned(shared[0], len(keys))
+    return shared[0][kept], shared[1][kept], shared[2][kept]
+
+
+def _thinned(edges: Array, count: int) -> Array | slice:
+    """Which shared rays of the edges (S) to use: all, or some of each edge where they are many."""
+    if len(edges) <= MANY_SHARED_RAYS:
+        return slice(None)
+    enough = max(ENOUGH_SHARED_RAYS, MANY_SHARED_RAYS // count)
+    sizes = np.bincount(edges, minlength=count)
+    order = np.argsort(edges, kind="stable")
+    rank = np.empty(len(edges), np.int64)
+    rank[order] = np.arange(len(edges)) - np.repeat(offsets_of(sizes)[:-1], sizes)
+    return np.flatnonzero(rank % -(-sizes[edges] // enough) == 0)
 
 
 def refine_directions(

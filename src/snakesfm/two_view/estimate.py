@@ -27,6 +27,8 @@ REACH_FACTOR = 4.0
 HOPELESS_SHARE = 0.6
 # squared, in standard deviations of the pose with a direction
 MAX_BEND_SQUARED = 16.0
+# from fewer inliers, which five parameters chose and fit, the covariance of a pose comes out too small
+SURE_INLIERS = 50
 TWIN_PLANE_RATIO = 0.4
 TWIN_START_RATIO = 0.5
 TWIN_INLIER_RATIO = 0.85
@@ -266,7 +268,7 @@ def _rotation_alone(
     rotation, covariance = fit_rotation(points.take(rows), first, 1.0, SIGMA_FLOOR_PX)
     bend = log_so3(rotation @ refined.rotation.T)
     squared = float(bend @ np.linalg.solve(refined.covariance[:3, :3], bend))
-    if squared > MAX_BEND_SQUARED:
+    if squared > MAX_BEND_SQUARED * max(1.0, SURE_INLIERS / len(inliers)) ** 2:
         return None
     # by chance the square is as large as there are coordinates
     excess = max(1.0 - len(bend) / max(squared, 1e-12), 0.0)

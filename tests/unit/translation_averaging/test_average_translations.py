@@ -7,6 +7,7 @@ from snakesfm.config.average_translations import AverageTranslationsOptions
 from snakesfm.geometry.rotations import angle_between
 from snakesfm.stages.average_translations import positioning_settings
 from snakesfm.synthetic.problems import make_problem, perturb_rotations
+from snakesfm.translation_averaging import scale_chain
 from snakesfm.translation_averaging.angular import refine_angles
 from snakesfm.translation_averaging.average import (
     DOUBTFUL_SHARE,
@@ -173,6 +174,23 @@ def test_shared_rays_lists_each_common_track_of_each_edge():
     seen = [set(problem.ray_tracks[problem.ray_images == i].tolist()) for i in range(8)]
     expected = [len(seen[i] & seen[j]) for i, j in truth.pairs.tolist()]
     assert np.bincount(edge, minlength=len(truth.pairs)).tolist() == expected
+
+
+def test_of_many_shared_rays_each_edge_keeps_some(monkeypatch):
+    truth = make_problem(8, 200, "area")
+    problem = positioning(truth)
+    every, *_ = shared_rays(problem)
+    counts = np.bincount(every, minlength=len(truth.pairs))
+    monkeypatch.setattr(scale_chain, "MANY_SHARED_RAYS", len(every) // 2)
+    monkeypatch.setattr(scale_chain, "ENOUGH_SHARED_RAYS", 5)
+    edge, left, right = shared_rays(problem)
+    assert np.array_equal(problem.ray_tracks[left], problem.ray_tracks[right])
+    assert np.array_equal(problem.ray_images[left], problem.pairs[edge, 0])
+    enough = len(every) // 2 // len(truth.pairs)
+    kept = np.bincount(edge, minlength=len(truth.pairs))
+    assert (kept <= np.minimum(counts, enough)).all()
+    assert (kept >= np.minimum(counts, enough / 2)).all()
+    assert kept.sum() < len(every)
 
 
 def test_directions_of_outlier_pairs_are_mended_from_rays():
