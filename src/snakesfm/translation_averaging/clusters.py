@@ -133,7 +133,9 @@ def _place(
     solution, covariance, agree, usual = solved
     moves = np.concatenate([fresh[:, :, None], np.broadcast_to(np.eye(3), (len(fresh), 3, 3))], axis=2)
     sigmas = np.sqrt(np.linalg.eigvalsh(moves @ covariance @ moves.transpose(0, 2, 1))[:, 2])
-    firm = solution[0] > 0 and 2 * np.count_nonzero(agree) >= len(agree)
+    equations = np.concatenate([np.full(len(ties.reach), 3), np.full(len(ties.lines), 2)])
+    # any two edges meet four unknowns exactly, so only what is left over confirms them
+    firm = solution[0] > 0 and equations[agree].sum() - 4 >= equations[~agree].sum()
     if not firm or (sigmas > max_relative_sigma * usual).any():
         return None
     return np.asarray(solution[0] * cluster + solution[1:])

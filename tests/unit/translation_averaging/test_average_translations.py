@@ -16,6 +16,7 @@ from snakesfm.translation_averaging.average import (
     normalize_gauge,
 )
 from snakesfm.translation_averaging.averagers import share_at_one_scale, with_rays
+from snakesfm.translation_averaging.clusters import join_by_edges
 from snakesfm.translation_averaging.landmarks import cover_cameras, edge_angles_rad, intersect
 from snakesfm.translation_averaging.problem import (
     PositioningProblem,
@@ -162,6 +163,37 @@ def test_lines_that_meet_ahead_outweigh_more_that_meet_behind():
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     (point,) = intersect(origins, rays, np.zeros(5, dtype=int), 1, rounds=20)
     assert np.linalg.norm(point - ahead) < 0.05
+
+
+def join_two_clusters(seed: int, ties: int, wrong: int) -> float | None:
+    """Mean error of the second of two clusters, each 8 cameras about 3 wide, by edges some of them wrong."""
+    rng = np.random.default_rng(seed)
+    centers = np.concatenate([rng.normal(size=(8, 3)) * 3, rng.normal(size=(8, 3)) * 3 + [8, 0, 0]])
+    within = [(i, j) for first in (0, 8) for i in range(first, first + 8) for j in range(i + 1, first + 8)]
+    between = rng.permutation(64)[:ties]
+    pairs = np.concatenate([within, np.column_stack([between // 8, 8 + between % 8])])
+    directions = centers[pairs[:, 1]] - centers[pairs[:, 0]]
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    directions += rng.normal(size=directions.shape) * np.radians(0.5)
+    if wrong:
+        directions[-wrong:] = rng.normal(size=(wrong, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    none = np.zeros(0, np.int64)
+    problem = PositioningProblem(16, pairs, directions, np.ones(len(pairs)), none, none, np.zeros((0, 3)))
+    first, second = centers.copy(), (centers - [3, 1, 2]) * 0.37
+    first[8:], second[:8] = np.nan, np.nan
+    joined = join_by_edges(problem, [first, second], 0.1)[8:]
+    return float(np.linalg.norm(joined - centers[8:], axis=1).mean()) if np.isfinite(joined).all() else None
+
+
+@pytest.mark.parametrize(
+    ("ties", "wrong", "joined", "wrongly"), [(3, 0, 40, 0), (3, 1, 0, 3), (4, 1, 30, 1), (4, 2, 0, 4)]
+)
+def test_clusters_are_joined_by_more_edges_than_fit_by_chance(ties, wrong, joined, wrongly) -> None:
+    errors = [join_two_clusters(seed, ties, wrong) for seed in range(80)]
+    found = np.array([error for error in errors if error is not None])
+    assert joined <= len(found) <= 80
+    assert np.count_nonzero(found > 1.5) <= wrongly
 
 
 def test_shared_rays_lists_each_common_track_of_each_edge():
