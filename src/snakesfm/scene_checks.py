@@ -13,7 +13,7 @@ from snakesfm.given_files import (
     looks_like_cameras,
 )
 from snakesfm.hloc_files import FEATURES, MATCHES
-from snakesfm.ingest.discover import count_images, list_photographs, walk_images
+from snakesfm.ingest.discover import count_images, list_photographs, resolved_name, walk_images
 from snakesfm.ingest.masks import find_mask
 from snakesfm.scene_plan import ScenePlan
 
@@ -42,6 +42,31 @@ def check_scene(scene: ScenePlan) -> None:
         raise ConfigError(
             f"weights={scene.weights} is a single file, but scene '{scene.name}' needs the weights of "
             f"{len(models)} networks ({', '.join(models)}): give a folder that contains them all."
+        )
+
+
+def check_results(scene: ScenePlan) -> None:
+    """Refuse to replace the results of another image folder that has the same name and is still there.
+
+    Where the user named the scene, nothing is refused, so that images may come to lie elsewhere.
+
+    Raises
+    ------
+    ConfigError : names the other folder and the remedy.
+    """
+    index = scene.folder / "index_images" / "index.h5"
+    if scene.configuration.scene or scene.configuration.scenes or not index.is_file():
+        return
+    # loaded here, as jobs parse the Snakefile too and need not ask
+    from snakesfm.artifacts.base import read_header
+
+    former = str(read_header(index).get("images", ""))
+    if former in ("", resolved_name(scene.images)) or not Path(former).is_dir():
+        return
+    if not Path(former).samefile(scene.images):
+        raise ConfigError(
+            f"'{scene.folder}' holds the results of '{former}': set scene=NAME or another output=DIR (or "
+            f"scene={scene.name} to replace them)."
         )
 
 

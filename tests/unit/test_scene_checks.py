@@ -5,10 +5,15 @@ import tempfile
 from pathlib import Path
 
 import pytest
+from PIL import Image
 from users import without_root
 
 from snakesfm.errors import ConfigError
 from snakesfm.plan import Plan
+from snakesfm.scene_checks import check_results
+from snakesfm.scene_plan import ScenePlan
+from snakesfm.stages import index_images
+from snakesfm.stages.job import StageJob
 
 MATRIX = "500 0 320\n0 500 240\n0 0 1\n"
 CAMERAS = "# Camera list\n1 PINHOLE 640 480 500 500 320 240\n"
@@ -117,6 +122,34 @@ def test_a_path_of_another_kind_is_refused(key: str, path: str, message: str, tm
     with pytest.raises(ConfigError, match=f"given as {key}= for scene 'photos', {message}") as refused:
         plan_of(tmp_path, **{key: path})
     assert "\n" not in str(refused.value)
+
+
+def test_results_are_of_the_folder_that_was_indexed(tmp_path: Path) -> None:
+    def scene_of(images: Path, **config: object) -> ScenePlan:
+        images.mkdir(parents=True, exist_ok=True)
+        for name in "ab":
+            Image.new("L", (64, 48), ord(name)).save(images / f"{name}.png")
+        (scene,) = Plan({"images": str(images), "output": str(tmp_path / "out"), **config}).scenes.values()
+        return scene
+
+    first = scene_of(tmp_path / "1" / "photos")
+    check_results(first)
+    settings = {"images": str(first.images), "blocks": 2}
+    index = first.folder / "index_images" / "index.h5"
+    options = first.options("index_images")
+    index_images.run(StageJob("index_images", first.name, {}, (index,), options, settings))
+    check_results(first)
+    (tmp_path / "3").symlink_to(tmp_path / "1")
+    check_results(scene_of(tmp_path / "3" / "photos"))
+    other = tmp_path / "2" / "photos"
+    with pytest.raises(ConfigError, match=r"results of '.*/1/photos': set scene=NAME .*scene=photos"):
+        check_results(scene_of(other))
+    check_results(scene_of(other, scene="photos"))
+    listed = Plan({"output": str(tmp_path / "out"), "scenes": {"photos": {"images": str(other)}}})
+    check_results(listed.scenes["photos"])
+    # moved photographs
+    (tmp_path / "1" / "photos").rename(tmp_path / "moved")
+    check_results(scene_of(other))
 
 
 @pytest.mark.parametrize(("images", "hint"), [("demo/images", True), ("photos/images", False)])

@@ -18,6 +18,7 @@ from snakesfm.plan import Plan
 from snakesfm.records import check_folder, makes_nothing, split_words
 from snakesfm.rule_settings import check_named_together, share_resources
 from snakesfm.run import Run
+from snakesfm.scene_checks import check_results
 from snakesfm.scene_plan import ScenePlan
 from snakesfm.termination import answer_term_aside
 
@@ -39,6 +40,8 @@ try:
     PLAN = Plan(config, weights_only="fetch_weights" in asked)
     if workflow.is_main_process:
         check_named_together(words, "select_pairs", PLAN.select_pairs_twins())
+        for planned in PLAN.scenes.values():
+            check_results(planned)
     RUN = Run(PLAN)
     if workflow.is_main_process and not makes_nothing(sys.argv[1:]):
         RUN.refuse_unrecorded(asked)

@@ -74,6 +74,11 @@ def count_images(folder: Path | str, limit: int | None = None) -> int:
     return sum(1 for _ in islice(walk_images(folder), limit))
 
 
+def resolved_name(folder: Path) -> str:
+    """A folder's absolute path without links, for an artifact: what is no UTF-8 is escaped."""
+    return str(folder.resolve()).encode("utf-8", "backslashreplace").decode()
+
+
 def fingerprint_images(folder: Path | str, cache_file: Path | str | None = None) -> str:
     """Digest of the names and contents of all image files of a folder.
 
