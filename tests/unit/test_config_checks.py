@@ -1,11 +1,12 @@
 """What is given twice is refused, as Snakemake would lose one of the two without a word."""
 
 import shlex
+from pathlib import Path
 
 import pytest
 from snakemake.cli import get_argument_parser
 
-from snakesfm.config_checks import check_given_once
+from snakesfm.config_checks import check_given_once, check_keys
 from snakesfm.errors import ConfigError
 
 
@@ -46,3 +47,47 @@ def test_how_often_an_option_is_given_is_said() -> None:
 )
 def test_other_options_that_begin_alike_are_taken(command: str) -> None:
     check_given_once(shlex.split(command))
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (
+            "seed: 1\nmatch_pairs:\n  max_ratio: 0.7\nseed: 2\n",
+            "'seed' .* (lines 1 and 4): remove one of them",
+        ),
+        (
+            "adjust_bundle: {refine_keypoints: false}\nseed: 1\nadjust_bundle:\n  max_iterations: 9\n",
+            "'adjust_bundle' .* (lines 1 and 3): join the blocks",
+        ),
+        ("scenes:\n  a: {images: x}\n  'a': {images: y}\n", "'a' .* (lines 2 and 3): join the blocks"),
+        ("scenes:\n  1: {images: x}\n  '1': {images: y}\n", "'1' .* (lines 2 and 3): join the blocks"),
+        ("a: [{b: 1,\n  b: 2}]\n", "'b' .* (lines 1 and 2): remove one of them"),
+        ('{"seed": 1,\n"seed": 2}', "'seed' .* (lines 1 and 2): remove one of them"),
+    ],
+)
+def test_a_key_that_stands_twice_in_a_file_is_refused(text: str, message: str, tmp_path: Path) -> None:
+    file = tmp_path / "mine.yaml"
+    file.write_text(text)
+    words = message.replace("(", r"\(").replace(")", r"\)").replace(" .* ", f" stands twice in {file} ")
+    with pytest.raises(ConfigError, match=f"^Key {words}\\.$"):
+        check_keys([file])
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "seed: 1\n",
+        "scenes:\n  a: &x {images: x}\n  b: {<<: *x, images: y}\n  c: *x\n",
+        "a: &a {x: 1}\nb: &b {y: 1}\nc:\n  <<: *a\n  <<: *b\n",
+        "a: &a [*a]\n",
+        "? [1, 2]\n: x\n? [1, 2]\n: y\n",
+        "a: {b: 1}\nc: {b: 1}\n",
+        "a: [\n",
+    ],
+)
+def test_files_without_a_repeated_key_are_taken(text: str, tmp_path: Path) -> None:
+    file = tmp_path / "mine.yaml"
+    file.write_text(text)
+    check_keys([file, tmp_path / "missing.yaml"])

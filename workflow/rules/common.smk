@@ -12,7 +12,7 @@ from snakesfm import resources, rule_inputs, slurm
 from snakesfm.errors import SnakesfmError
 from snakesfm.blocks import tile_names
 from snakesfm.config.configuration import SCENE_PATTERN, check_spelling
-from snakesfm.config_checks import check_given_once
+from snakesfm.config_checks import check_given_once, check_keys
 from snakesfm.job_server import JobServer
 from snakesfm.model_files import MODEL_FILES
 from snakesfm.plan import Plan
@@ -38,6 +38,7 @@ try:
     if workflow.is_main_process:
         check_folder(workflow.main_snakefile)
         check_given_once(sys.argv[1:])
+        check_keys(workflow.overwrite_configfiles)
     check_spelling(config, sys.argv[1:])
     PLAN = Plan(config, weights_only="fetch_weights" in asked)
     if workflow.is_main_process:
