@@ -125,7 +125,7 @@ class RunOptions(SceneInputs):
     front_end: FrontEndName = ""
     """Detector and matcher by one name; empty uses the methods set in extract_features and match_pairs."""
     weights: str = "weights"
-    """Folder (or one file) of network weights, filled by 'snakemake fetch_weights'; jobs never download."""
+    """Folder (or one file) of network weights, filled by target 'fetch_weights'; jobs never download."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """Device for networks: 'auto' uses CUDA if available, 'cpu' never does, 'cuda' fails without it."""
     batch_size: Annotated[int, Field(ge=1, le=256)] | Literal["auto"] = "auto"
