@@ -21,7 +21,7 @@ from snakesfm.rule_settings import check_named_together, share_resources
 from snakesfm.run import Run
 from snakesfm.scene_checks import check_results
 from snakesfm.scene_plan import ScenePlan
-from snakesfm.termination import answer_term_aside
+from snakesfm.termination import answer_interrupt, answer_term_aside
 
 
 def refusal(error):
@@ -210,6 +210,7 @@ def rules_by_scene(jobs):
 def start_run():
     """Lock the output folder for this run, and say what is about to be done."""
     answer_term_aside(workflow.scheduler)
+    answer_interrupt(RUN.note_interrupt)
     executor = getattr(workflow.scheduler, "_executor", None)
     # the SLURM executor names all jobs of a run alike
     slurm_run = getattr(executor, "run_uuid", "")
