@@ -162,6 +162,39 @@ def test_how_to_make_the_demo_is_said_where_it_is_missing(
     assert ("make demo" in str(refused.value)) == hint
 
 
+@pytest.mark.parametrize("listed", [False, True])
+@pytest.mark.parametrize(
+    ("files", "images", "message"),
+    [
+        ([], "nowhere", "does not exist: "),
+        (
+            ["a.zip"],
+            "a.zip",
+            r"is a file: give the folder .* \(unpack an archive; extract a video's frames",
+        ),
+        (["a/notes.txt"], "a", "contains no JPEG, PNG, TIFF, WebP or BMP image: "),
+        (["a/b/1.MOV", "a/2.mp4"], "a", r"no .* image: extract .* such as '2\.mp4', .* \(2 files\)\.$"),
+        (["a/1.HEIC", "a/2.mov"], "a", r"no .* image: convert .* such as '1\.HEIC' to JPEG \(1 files\)\.$"),
+    ],
+)
+def test_what_to_do_where_there_are_no_images(
+    files: list[str], images: str, message: str, listed: bool, tmp_path: Path
+) -> None:
+    for name in files:
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_bytes(b"x")
+    path = str(tmp_path / images)
+    config = {"scenes": {"s": {"images": path}}} if listed else {"images": path}
+    with pytest.raises(ConfigError, match=message) as refused:
+        Plan({"output": str(tmp_path / "out"), **config})
+    sentence = str(refused.value)
+    assert "\n" not in sentence and path in sentence
+    if message.endswith(": "):
+        # in a file that lists scenes, the key images is refused beside them
+        assert ("--config images=PATH" in sentence) == (not listed)
+        assert ("of scene 's'" in sentence and "correct its images: in the file" in sentence) == listed
+
+
 def test_what_may_not_be_read_is_named() -> None:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)

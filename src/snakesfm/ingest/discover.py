@@ -21,6 +21,7 @@ UNREAD_SUFFIXES = (
     *(".avif", ".heic", ".heif", ".jxl"),
     *(".arw", ".cr2", ".cr3", ".dng", ".nef", ".orf", ".raf", ".rw2"),
 )
+VIDEO_SUFFIXES = (".avi", ".mkv", ".mov", ".mp4")
 MASK_DIGESTS_NAME = "mask_digests.json"
 CACHE_VERSION = 2
 # a file that was written so shortly before may change again within one tick of the file system's clock
@@ -62,6 +63,11 @@ def list_photographs(folder: Path | str) -> tuple[list[str], list[str]]:
     read = {PurePosixPath(name).with_suffix("") for name in images}
     others = [name for name in names if name.lower().endswith(UNREAD_SUFFIXES)]
     return images, [name for name in others if PurePosixPath(name).with_suffix("") not in read]
+
+
+def list_videos(folder: Path | str) -> list[str]:
+    """The video files of a folder at any depth, as :func:`list_images` lists images."""
+    return sorted(_walk(Path(folder), "", frozenset(), VIDEO_SUFFIXES))
 
 
 def count_images(folder: Path | str, limit: int | None = None) -> int:
