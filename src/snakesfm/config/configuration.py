@@ -4,6 +4,7 @@ import datetime
 import difflib
 import functools
 import importlib
+import os
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -282,8 +283,8 @@ def _keys_beside(cls: type[BaseModel], path: list[str]) -> list[str]:
 
 
 def scene_name(images: str) -> str:
-    """The name of a scene: its folder's, or its parent's where the folder is called 'images'."""
-    folder = Path(images).expanduser().resolve()
+    """The name of a scene: its folder's as given, or its parent's where the folder is called 'images'."""
+    folder = Path(os.path.abspath(Path(images).expanduser()))  # noqa: PTH100 - resolve() follows links
     return folder.parent.name if folder.name.lower() == "images" else folder.name
 
 
