@@ -182,8 +182,8 @@ def render_artifacts_page() -> str:
         "The root attributes are `artifact` (the kind below), `format_version`, `stage`, `stage_version`, `scene`, "
         "`options`, `settings` (canonical JSON; `settings` holds the seed and other inputs that are not options), "
         "`software`, and `checksum` (CRC-32 of all datasets in the order of the table below; readers refuse a file "
-        "with another one); there are no timestamps, so equal runs give equal bytes. Readers refuse other kinds and "
-        "versions.",
+        "with another one); the index also has `images`, the folder that it is of, which no job compares. There are "
+        "no timestamps, so equal runs on one image folder give equal bytes. Readers refuse other kinds and versions.",
         "",
         "Letters in shapes are lengths: the same letter is the same length within one file, and `P+1` is one more "
         "than `P`. Items that belong to others (matches of a pair, keypoints of an image) are stored in flat tables "

@@ -1,5 +1,6 @@
 """Front-ends by name: their detectors and matchers, what fits together, and the weights they need."""
 
+import shlex
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -79,7 +80,7 @@ def needed_weights(stage: str, method: str, detector: str) -> list[str]:
 
 
 def fetch_command(front_end: str, methods: Mapping[str, str], weights: str) -> str:
-    """The command that fetches the weights of a run.
+    """The command that fetches the weights of a run, as a shell takes it, in any folder.
 
     Parameters
     ----------
@@ -90,8 +91,9 @@ def fetch_command(front_end: str, methods: Mapping[str, str], weights: str) -> s
     named = {stage: method for stage, method in methods.items() if method in LEARNED_METHODS}
     chosen = [f"front_end={front_end}"] if front_end else []
     chosen += [
-        f"'{stage}={{method: {method}}}'"
+        f"{stage}={{method: {method}}}"
         for stage, method in named.items()
         if not front_end or stage not in ("extract_features", "match_pairs")
     ]
-    return " ".join(["snakemake fetch_weights --config", *chosen, f"weights={weights}"])
+    command = ["snakemake", "--cores", "1", "fetch_weights", "--config", *chosen, f"weights={weights}"]
+    return shlex.join(command)

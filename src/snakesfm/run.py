@@ -22,6 +22,7 @@ from snakesfm.scene_plan import ScenePlan
 
 LOCK_NAME = ".snakesfm.lock"
 MOST_SENTENCES = 10
+KILLED = "was killed from outside (out of memory, time limit, cancelled, or its node failed)"
 RELATIVE_AUC = re.compile(r"relative_pose_auc_(.+)deg")
 
 
@@ -34,6 +35,11 @@ class Run:
         self.lock: Any = None
         self.slurm_run = ""
         self.planned: Mapping[str, Set[str]] = {}
+        self.interrupted = False
+
+    def note_interrupt(self) -> None:
+        """Jobs that are killed from now on are so by the user's own wish."""
+        self.interrupted = True
 
     def refuse_unrecorded(self, asked: Set[str]) -> None:
         """Set aside what other images, options or seeds made and Snakemake knows nothing of.
@@ -183,7 +189,7 @@ class Run:
                 print(f"snakesfm: scene '{scene.name}': warning: {warning}", flush=True)
 
     def fail(self, planned: Mapping[str, Set[str]], unfinished: Set[str]) -> None:
-        """One line per scene: its model where its jobs are done, else the sentences of its failed jobs.
+        """Per scene its model where its jobs are done, else why they are not, and what to do if that helps.
 
         Parameters
         ----------
@@ -199,22 +205,26 @@ class Run:
                 self._note("")
         for scene in self.plan.scenes.values():
             sentences = self.failures(scene)
-            if sentences:
-                for sentence in sentences[:MOST_SENTENCES]:
-                    print(f"snakesfm: scene '{scene.name}' failed: {sentence}", flush=True)
-                if len(sentences) > MOST_SENTENCES:
-                    more = len(sentences) - MOST_SENTENCES
-                    print(f"snakesfm: scene '{scene.name}' failed: {more} more jobs.", flush=True)
-            elif scene.name in unfinished:
+            for sentence in sentences[:MOST_SENTENCES]:
+                print(f"snakesfm: scene '{scene.name}' failed: {sentence}", flush=True)
+            if len(sentences) > MOST_SENTENCES:
+                more = len(sentences) - MOST_SENTENCES
+                print(f"snakesfm: scene '{scene.name}' failed: {more} more jobs.", flush=True)
+            if any(KILLED in sentence for sentence in sentences) or (
+                not sentences and scene.name in unfinished
+            ):
                 print(
                     f"snakesfm: scene '{scene.name}' is not finished: start the same command again.",
                     flush=True,
                 )
-            else:
+            elif not sentences:
                 print(self.describe(scene), flush=True)
 
     def failures(self, scene: ScenePlan) -> list[str]:
-        """The sentences of the scene's jobs that failed in this run, with their logs."""
+        """The sentences of the scene's jobs that failed in this run, with their logs.
+
+        Jobs that were killed are left out where the user interrupted the run, which kills them.
+        """
         sentences = []
         for log in sorted((scene.folder / "logs").rglob("*.log")):
             if log.stat().st_mtime < self.started:
@@ -223,11 +233,8 @@ class Run:
             # one that is killed before its first line leaves an empty log
             if lines and lines[-1].startswith("error: "):
                 sentences.append(f"{lines[-1].removeprefix('error: ')} (log: {log})")
-            elif not lines or not find_cost(lines[-1]):
-                sentences.append(
-                    f"{log.parent.name} {log.stem} was killed from outside (out of memory, time limit, "
-                    f"cancelled, or its node failed) (log: {log})"
-                )
+            elif not self.interrupted and (not lines or not find_cost(lines[-1])):
+                sentences.append(f"{log.parent.name} {log.stem} {KILLED} (log: {log})")
         return sentences
 
     def _summary(self, scene: ScenePlan) -> dict[str, Any]:

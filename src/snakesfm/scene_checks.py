@@ -13,9 +13,17 @@ from snakesfm.given_files import (
     looks_like_cameras,
 )
 from snakesfm.hloc_files import FEATURES, MATCHES
-from snakesfm.ingest.discover import count_images, list_photographs, walk_images
+from snakesfm.ingest.discover import (
+    count_images,
+    list_photographs,
+    list_videos,
+    resolved_name,
+    walk_images,
+)
 from snakesfm.ingest.masks import find_mask
 from snakesfm.scene_plan import ScenePlan
+
+CORRECT = "correct its images: in the file that lists it"
 
 
 def check_scene(scene: ScenePlan) -> None:
@@ -45,8 +53,41 @@ def check_scene(scene: ScenePlan) -> None:
         )
 
 
+def check_results(scene: ScenePlan) -> None:
+    """Refuse to replace the results of another image folder that has the same name and is still there.
+
+    Where the user named the scene, nothing is refused, so that images may come to lie elsewhere.
+
+    Raises
+    ------
+    ConfigError : names the other folder and the remedy.
+    """
+    index = scene.folder / "index_images" / "index.h5"
+    if scene.configuration.scene or scene.configuration.scenes or not index.is_file():
+        return
+    # loaded here, as jobs parse the Snakefile too and need not ask
+    from snakesfm.artifacts.base import read_header
+
+    former = str(read_header(index).get("images", ""))
+    if former in ("", resolved_name(scene.images)) or not Path(former).is_dir():
+        return
+    if not Path(former).samefile(scene.images):
+        raise ConfigError(
+            f"'{scene.folder}' holds the results of '{former}': set scene=NAME or another output=DIR (or "
+            f"scene={scene.name} to replace them)."
+        )
+
+
 def _check_images(scene: ScenePlan) -> None:
     images = scene.images
+    if images.is_file():
+        raise ConfigError(
+            f"'{images}', given as images= for scene '{scene.name}', is a file: give the folder that "
+            "contains the images (unpack an archive; extract a video's frames, e.g. with ffmpeg)."
+        )
+    listed = scene.name in scene.configuration.scenes
+    if not images.is_dir() and listed:
+        raise ConfigError(f"The image folder '{images}' of scene '{scene.name}' does not exist: {CORRECT}.")
     if not images.is_dir():
         hint = "make it with 'make demo', or " if scene.inputs.images == "demo/images" else ""
         raise ConfigError(
@@ -65,13 +106,23 @@ def _check_images(scene: ScenePlan) -> None:
             "pictures would be treated as photographs: choose another output=DIR."
         )
     if count_images(images, 1) == 0:
-        _, unread = list_photographs(images)
-        remedy = (
-            f"convert files such as '{unread[0]}' to JPEG ({len(unread)} files)."
-            if unread
-            else "choose another one with --config images=PATH."
+        whose = f" of scene '{scene.name}'" if listed else ""
+        otherwise = CORRECT if listed else "choose another one with --config images=PATH"
+        raise ConfigError(
+            f"The folder '{images}'{whose} contains no JPEG, PNG, TIFF, WebP or BMP image: "
+            f"{_find_images(images, otherwise)}."
         )
-        raise ConfigError(f"The folder '{images}' contains no JPEG, PNG, TIFF, WebP or BMP image: {remedy}")
+
+
+def _find_images(folder: Path, otherwise: str) -> str:
+    """How a folder without images gets some from its files, or what is to be done otherwise."""
+    _, unread = list_photographs(folder)
+    if unread:
+        return f"convert files such as '{unread[0]}' to JPEG ({len(unread)} files)"
+    videos = list_videos(folder)
+    if videos:
+        return f"extract the frames of videos such as '{videos[0]}', e.g. with ffmpeg ({len(videos)} files)"
+    return otherwise
 
 
 def _check_keys_together(scene: ScenePlan) -> None:

@@ -2,7 +2,8 @@
 
 FOLDER gets images/ (empty files that only name the images), reference/ (the true cameras as a COLMAP
 model), config.yaml, results/SCENE/ with the artifacts of the first stages, and truth/ with the landmark
-that every keypoint shows. ``snakemake --configfile FOLDER/config.yaml`` goes on from there.
+that every keypoint shows. ``snakemake --profile profiles/local --configfile
+FOLDER/config.yaml`` goes on from there.
 """
 
 import hashlib

@@ -1,8 +1,10 @@
-"""How the snakemake command answers TERM."""
+"""How the snakemake command answers TERM and INT."""
 
 import queue
 import signal
 import threading
+from collections.abc import Callable
+from types import FrameType
 from typing import Any
 
 
@@ -29,3 +31,22 @@ def answer_term_aside(scheduler: Any) -> None:
 
     threading.Thread(target=answer, name="answer TERM", daemon=True).start()
     signal.signal(signal.SIGTERM, lambda number, _: asked.put(number))
+
+
+def answer_interrupt(note: Callable[[], None]) -> None:
+    """Have the user's interrupt, as by Ctrl-C, noted before it ends this process's work.
+
+    Nothing is changed where another handler is installed, or interrupts are ignored, as in the background.
+
+    Parameters
+    ----------
+    note : called in the signal handler, so it takes no lock.
+    """
+    if signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
+        return
+
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        note()
+        signal.default_int_handler(number, frame)
+
+    signal.signal(signal.SIGINT, interrupt)

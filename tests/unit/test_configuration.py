@@ -2,6 +2,7 @@
 
 import datetime
 import json
+from pathlib import Path
 
 import pytest
 from hypothesis import given
@@ -110,6 +111,22 @@ def test_scene_takes_the_name_of_its_folder_or_of_its_parent() -> None:
     assert scene_name("/data/castle") == "castle"
     assert scene_name("/data/castle/images") == "castle"
     assert scene_name("/data/castle/Images/") == "castle"
+
+
+def test_a_scene_has_the_name_of_the_link_that_was_given(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "DCIM" / "100_42" / "sub").mkdir(parents=True)
+    (tmp_path / "castle").symlink_to(tmp_path / "DCIM" / "100_42")
+    assert scene_name(str(tmp_path / "castle")) == "castle"
+    assert scene_name(f"{tmp_path}/castle/./sub/../") == "castle"
+    (tmp_path / "church").mkdir()
+    (tmp_path / "church" / "images").symlink_to(tmp_path / "DCIM" / "100_42")
+    assert scene_name(str(tmp_path / "church" / "images")) == "church"
+    monkeypatch.setenv("HOME", str(tmp_path))
+    assert scene_name("~/castle") == "castle"
+    monkeypatch.chdir(tmp_path / "church")
+    assert [scene_name(name) for name in (".", "images", "../castle/")] == ["church", "church", "castle"]
 
 
 @pytest.mark.parametrize("value", [2024, datetime.date(2024, 5, 1)])

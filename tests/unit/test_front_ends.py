@@ -1,6 +1,7 @@
 """Front-ends by name: their methods, what fits together, and what a plan makes of them."""
 
 import json
+import shlex
 import typing
 from pathlib import Path
 from typing import Any
@@ -8,6 +9,7 @@ from typing import Any
 import h5py
 import numpy as np
 import pytest
+from snakemake.cli import get_argument_parser
 
 from snakesfm.config.configuration import STAGES, FrontEndName, options_class
 from snakesfm.digests import settings_text
@@ -19,6 +21,7 @@ from snakesfm.front_ends import (
     LEARNED_DESCRIPTORS,
     TRAINED_ON,
     check_methods,
+    fetch_command,
     needed_weights,
 )
 from snakesfm.learned.weights import WEIGHT_FILES
@@ -112,8 +115,16 @@ def test_a_front_end_sets_the_methods_and_names_its_weights(tmp_path: Path) -> N
     match = json.loads(scene.params("match_pairs", {"tile": "0-0"}, True))
     assert match["options"]["method"] == "lightglue" and match["settings"]["detector"] == "aliked"
     command = match["settings"]["fetch"]
-    assert command.startswith("snakemake fetch_weights --config front_end=aliked+lightglue")
-    assert f"weights={tmp_path / 'w'}" in command
+    assert command.endswith(f"fetch_weights --config front_end=aliked+lightglue weights={tmp_path / 'w'}")
+
+
+def test_the_command_that_fetches_weights_is_one_that_snakemake_takes() -> None:
+    command = fetch_command("loftr", {"describe_images": "megaloc", "match_pairs": "loftr"}, "my weights")
+    program, *arguments = shlex.split(command)
+    parsed = get_argument_parser().parse_args(arguments)
+    # without a number of cores it starts no job
+    assert (program, parsed.targets, parsed.cores) == ("snakemake", ["fetch_weights"], 1)
+    assert parsed.config == ["front_end=loftr", "describe_images={method: megaloc}", "weights=my weights"]
 
 
 def test_other_weights_change_the_params(tmp_path: Path) -> None:

@@ -15,6 +15,7 @@ from snakesfm.run import LOCK_NAME, Run
 
 MODEL = {"export_model", "evaluate_model"}
 SUMMARY = {"images": 9, "registered_images": 5, "points": 321, "mean_reprojection_error_px": 0.5}
+NOT_FINISHED = "snakesfm: scene 'scene' is not finished: start the same command again."
 METRICS = {f"relative_pose_auc_{degrees}deg": 90.0 + degrees for degrees in (1, 3, 5)}
 
 
@@ -96,16 +97,32 @@ def test_failed_jobs_are_told_by_their_logs(run: Run, capsys: pytest.CaptureFixt
     write("out/scene/logs/match_pairs/1-1.log", "12 pairs\nerror: It is full.\n")
     capsys.readouterr()
     run.fail({}, {"scene"})
-    killed, failed = capsys.readouterr().out.splitlines()
+    killed, failed, again = capsys.readouterr().out.splitlines()
     assert "scene 'scene' failed: match_pairs 0-1 was killed from outside" in killed
     log = "(log: out/scene/logs/match_pairs/1-1.log)"
     assert failed == f"snakesfm: scene 'scene' failed: It is full. {log}"
+    assert again == NOT_FINISHED
     for number in range(12):
         write(f"out/scene/logs/extract_features/{number}.log", f"error: {number}\n")
     run.fail({}, {"scene"})
     lines = capsys.readouterr().out.splitlines()
-    assert len(lines) == 11
-    assert lines[-1] == "snakesfm: scene 'scene' failed: 4 more jobs."
+    assert len(lines) == 12
+    assert lines[-2:] == ["snakesfm: scene 'scene' failed: 4 more jobs.", NOT_FINISHED]
+
+
+def test_the_next_step_is_said_of_what_failed_by_no_fault_of_its_own(
+    run: Run, capsys: pytest.CaptureFixture
+) -> None:
+    log = write("out/scene/logs/match_pairs/0-0.log", "12 pairs\n")
+    run.note_interrupt()
+    capsys.readouterr()
+    # jobs die by the interrupt too
+    run.fail({}, {"scene"})
+    assert capsys.readouterr().out.splitlines() == [NOT_FINISHED]
+    log.write_text("12 pairs\nerror: It is full.\n")
+    run.fail({}, {"scene"})
+    failed = f"snakesfm: scene 'scene' failed: It is full. (log: {log})"
+    assert capsys.readouterr().out.splitlines() == [failed]
 
 
 @pytest.mark.parametrize(

@@ -5,10 +5,15 @@ import tempfile
 from pathlib import Path
 
 import pytest
+from PIL import Image
 from users import without_root
 
 from snakesfm.errors import ConfigError
 from snakesfm.plan import Plan
+from snakesfm.scene_checks import check_results
+from snakesfm.scene_plan import ScenePlan
+from snakesfm.stages import index_images
+from snakesfm.stages.job import StageJob
 
 MATRIX = "500 0 320\n0 500 240\n0 0 1\n"
 CAMERAS = "# Camera list\n1 PINHOLE 640 480 500 500 320 240\n"
@@ -119,6 +124,34 @@ def test_a_path_of_another_kind_is_refused(key: str, path: str, message: str, tm
     assert "\n" not in str(refused.value)
 
 
+def test_results_are_of_the_folder_that_was_indexed(tmp_path: Path) -> None:
+    def scene_of(images: Path, **config: object) -> ScenePlan:
+        images.mkdir(parents=True, exist_ok=True)
+        for name in "ab":
+            Image.new("L", (64, 48), ord(name)).save(images / f"{name}.png")
+        (scene,) = Plan({"images": str(images), "output": str(tmp_path / "out"), **config}).scenes.values()
+        return scene
+
+    first = scene_of(tmp_path / "1" / "photos")
+    check_results(first)
+    settings = {"images": str(first.images), "blocks": 2}
+    index = first.folder / "index_images" / "index.h5"
+    options = first.options("index_images")
+    index_images.run(StageJob("index_images", first.name, {}, (index,), options, settings))
+    check_results(first)
+    (tmp_path / "3").symlink_to(tmp_path / "1")
+    check_results(scene_of(tmp_path / "3" / "photos"))
+    other = tmp_path / "2" / "photos"
+    with pytest.raises(ConfigError, match=r"results of '.*/1/photos': set scene=NAME .*scene=photos"):
+        check_results(scene_of(other))
+    check_results(scene_of(other, scene="photos"))
+    listed = Plan({"output": str(tmp_path / "out"), "scenes": {"photos": {"images": str(other)}}})
+    check_results(listed.scenes["photos"])
+    # moved photographs
+    (tmp_path / "1" / "photos").rename(tmp_path / "moved")
+    check_results(scene_of(other))
+
+
 @pytest.mark.parametrize(("images", "hint"), [("demo/images", True), ("photos/images", False)])
 def test_how_to_make_the_demo_is_said_where_it_is_missing(
     images: str, hint: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -127,6 +160,39 @@ def test_how_to_make_the_demo_is_said_where_it_is_missing(
     with pytest.raises(ConfigError, match=f"'{images}' does not exist") as refused:
         Plan({"images": images})
     assert ("make demo" in str(refused.value)) == hint
+
+
+@pytest.mark.parametrize("listed", [False, True])
+@pytest.mark.parametrize(
+    ("files", "images", "message"),
+    [
+        ([], "nowhere", "does not exist: "),
+        (
+            ["a.zip"],
+            "a.zip",
+            r"is a file: give the folder .* \(unpack an archive; extract a video's frames",
+        ),
+        (["a/notes.txt"], "a", "contains no JPEG, PNG, TIFF, WebP or BMP image: "),
+        (["a/b/1.MOV", "a/2.mp4"], "a", r"no .* image: extract .* such as '2\.mp4', .* \(2 files\)\.$"),
+        (["a/1.HEIC", "a/2.mov"], "a", r"no .* image: convert .* such as '1\.HEIC' to JPEG \(1 files\)\.$"),
+    ],
+)
+def test_what_to_do_where_there_are_no_images(
+    files: list[str], images: str, message: str, listed: bool, tmp_path: Path
+) -> None:
+    for name in files:
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_bytes(b"x")
+    path = str(tmp_path / images)
+    config = {"scenes": {"s": {"images": path}}} if listed else {"images": path}
+    with pytest.raises(ConfigError, match=message) as refused:
+        Plan({"output": str(tmp_path / "out"), **config})
+    sentence = str(refused.value)
+    assert "\n" not in sentence and path in sentence
+    if message.endswith(": "):
+        # in a file that lists scenes, the key images is refused beside them
+        assert ("--config images=PATH" in sentence) == (not listed)
+        assert ("of scene 's'" in sentence and "correct its images: in the file" in sentence) == listed
 
 
 def test_what_may_not_be_read_is_named() -> None:

@@ -1,13 +1,16 @@
 """Front-ends beside SIFT, from images to model."""
 
 import json
+import shlex
+import subprocess
+import sys
 from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
 from random_weights import megaloc_state, write_netvlad
-from workflow_runner import Workflow, copy_run
+from workflow_runner import ROOT, Workflow, copy_run
 
 from snakesfm.artifacts import (
     GlobalDescriptors,
@@ -23,6 +26,7 @@ from snakesfm.artifacts import (
 from snakesfm.artifacts.gather import gather_inlier_matches
 from snakesfm.artifacts.hloc import read_hloc_matches
 from snakesfm.evaluation.colmap_model import read_model
+from snakesfm.front_ends import fetch_command
 from snakesfm.learned.weights import WEIGHT_FILES
 
 pytestmark = pytest.mark.workflow
@@ -112,16 +116,24 @@ def test_missing_weights_end_the_run_with_one_sentence(small_scene: Path, workfl
     assert outcome.status != 0
     assert "Traceback" not in outcome.text
     sentence = next(line for line in outcome.summary if "failed" in line)
-    assert "'snakemake fetch_weights --config front_end=xfeat+lighterglue weights=weights" in sentence
+    assert f"'{fetch_command('xfeat+lighterglue', {}, 'weights')}" in sentence
 
 
 def test_the_weights_are_fetched_by_their_own_target(
     small_scene: Path, workflow: Workflow, weights: Path
 ) -> None:
     # neither images nor an output folder are needed
-    outcome = workflow.run("fetch_weights", "--config", "images=nowhere", "front_end=xfeat+lighterglue")
-    assert outcome.status == 0, outcome.text
-    assert "no model yet" not in outcome.text
+    command = shlex.split(fetch_command("xfeat+lighterglue", {}, "weights"))
+    done = subprocess.run(
+        [sys.executable, "-m", *command, "images=nowhere", "--snakefile", str(ROOT / "Snakefile")],
+        cwd=workflow.folder,
+        capture_output=True,
+        text=True,
+        timeout=300,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert "no model yet" not in done.stdout
     assert sorted(path.name for path in workflow.folder.iterdir()) == [".snakemake", "weights"]
     names = sorted(path.name for path in (workflow.folder / "weights").iterdir())
     assert names == ["SHA256SUMS", "xfeat-lighterglue.pt", "xfeat.pt"]

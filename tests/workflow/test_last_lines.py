@@ -2,8 +2,10 @@
 
 import os
 import re
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -64,6 +66,25 @@ def test_a_controller_that_gets_term_while_it_deals_with_ended_jobs_ends(
     assert again.status == 0, again.text
     assert "16 of 16 images registered" in again.summary[-1]
     assert model_bytes(workflow.folder / "out" / "square") == model_bytes(finished[0])
+
+
+def test_a_run_that_the_user_interrupts_says_how_to_go_on_and_names_no_failure(
+    finished, small_scene: Path, workflow: Workflow
+) -> None:
+    copy_run(finished[0], workflow.folder)
+    log = workflow.folder / "out" / "square" / "logs" / "extract_features" / "0.log"
+    log.unlink()
+    run = workflow.start(*config_of(small_scene, "extract_features={max_keypoints: 4000}"))
+    limit = time.monotonic() + 120
+    while not (log.is_file() and log.stat().st_size) and run.poll() is None and time.monotonic() < limit:
+        time.sleep(0.01)
+    # as the terminal does on Ctrl-C
+    os.killpg(run.pid, signal.SIGINT)
+    text, _ = run.communicate(timeout=120)
+    assert run.returncode == 1, text
+    lines = [line for line in text.splitlines() if line.startswith("snakesfm: scene")]
+    assert lines[-1] == "snakesfm: scene 'square' is not finished: start the same command again."
+    assert "killed from outside" not in text
 
 
 @pytest.mark.parametrize("closed", ["1", "2"])

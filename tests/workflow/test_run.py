@@ -237,7 +237,7 @@ def test_a_folder_without_records_is_held_against_its_images_and_seed(
     shutil.rmtree(workflow.folder / ".snakemake")
     scene = workflow.folder / "square"
     shutil.copytree(small_scene, scene)
-    config = config_of(scene)
+    config = [*config_of(scene), "scene=square"]
     if change == "an image":
         images = sorted((scene / "images").iterdir())
         shutil.copy(images[3], images[4])
@@ -249,13 +249,32 @@ def test_a_folder_without_records_is_held_against_its_images_and_seed(
     assert len(list((workflow.folder / "out").rglob("*.refused"))) == refused
 
 
+def test_another_folder_of_the_same_name_replaces_results_only_where_the_scene_is_named(
+    finished, small_scene: Path, workflow
+) -> None:
+    copy_run(finished[0], workflow.folder)
+    before = model_bytes(workflow.folder / "out" / "square")
+    scene = workflow.folder / "square"
+    shutil.copytree(small_scene, scene)
+    for call in ([], ["--dry-run"]):
+        outcome = workflow.run(*call, *config_of(scene))
+        assert outcome.status == 1 and outcome.rules == [] and "Traceback" not in outcome.text
+        holds = f"'out/square' holds the results of '{(small_scene / 'images').resolve()}'"
+        assert f"{holds}: set scene=NAME or another output=DIR" in outcome.text
+    assert model_bytes(workflow.folder / "out" / "square") == before
+    assert workflow.run("--dry-run", *config_of(scene), "scene=other").status == 0
+    (workflow.folder / "link").symlink_to(small_scene, target_is_directory=True)
+    linked = ["--config", "images=link/images", *config_of(small_scene)[2:], "scene=square"]
+    assert workflow.run("--dry-run", *linked).status == 0
+
+
 def test_an_added_image_is_indexed(finished, small_scene: Path, workflow) -> None:
     copy_run(finished[0], workflow.folder)
     scene = workflow.folder / "square"
     shutil.copytree(small_scene, scene)
     images = sorted((scene / "images").iterdir())
     shutil.copy(images[3], scene / "images" / "zz_copy.jpg")
-    outcome = workflow.run("--dry-run", *config_of(scene))
+    outcome = workflow.run("--dry-run", *config_of(scene), "scene=square")
     assert outcome.rules.count("index_images") == 1
 
 
@@ -359,7 +378,7 @@ def test_a_model_of_former_images_is_not_called_this_run_s(finished, small_scene
     scene = workflow.folder / "square"
     shutil.copytree(small_scene, scene)
     sorted((scene / "images").iterdir())[0].unlink()
-    outcome = workflow.run("databases", *config_of(scene))
+    outcome = workflow.run("databases", *config_of(scene), "scene=square")
     assert outcome.status == 0
     *_, line = outcome.summary
     assert "COLMAP database in out/square/export_database/database.db" in line

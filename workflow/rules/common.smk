@@ -12,14 +12,16 @@ from snakesfm import resources, rule_inputs, slurm
 from snakesfm.errors import SnakesfmError
 from snakesfm.blocks import tile_names
 from snakesfm.config.configuration import SCENE_PATTERN, check_spelling
+from snakesfm.config_checks import check_given_once, check_keys
 from snakesfm.job_server import JobServer
 from snakesfm.model_files import MODEL_FILES
 from snakesfm.plan import Plan
 from snakesfm.records import check_folder, makes_nothing, split_words
 from snakesfm.rule_settings import check_named_together, share_resources
 from snakesfm.run import Run
+from snakesfm.scene_checks import check_results
 from snakesfm.scene_plan import ScenePlan
-from snakesfm.termination import answer_term_aside
+from snakesfm.termination import answer_interrupt, answer_term_aside
 
 
 def refusal(error):
@@ -35,10 +37,14 @@ try:
     asked = {word.split(":")[0] for word in words}
     if workflow.is_main_process:
         check_folder(workflow.main_snakefile)
+        check_given_once(sys.argv[1:])
+        check_keys(workflow.overwrite_configfiles)
     check_spelling(config, sys.argv[1:])
     PLAN = Plan(config, weights_only="fetch_weights" in asked)
     if workflow.is_main_process:
         check_named_together(words, "select_pairs", PLAN.select_pairs_twins())
+        for planned in PLAN.scenes.values():
+            check_results(planned)
     RUN = Run(PLAN)
     if workflow.is_main_process and not makes_nothing(sys.argv[1:]):
         RUN.refuse_unrecorded(asked)
@@ -204,6 +210,7 @@ def rules_by_scene(jobs):
 def start_run():
     """Lock the output folder for this run, and say what is about to be done."""
     answer_term_aside(workflow.scheduler)
+    answer_interrupt(RUN.note_interrupt)
     executor = getattr(workflow.scheduler, "_executor", None)
     # the SLURM executor names all jobs of a run alike
     slurm_run = getattr(executor, "run_uuid", "")

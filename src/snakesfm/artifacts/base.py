@@ -30,13 +30,17 @@ STRING = h5py.string_dtype("utf-8")
 
 @dataclass(frozen=True)
 class Header:
-    """Where an artifact comes from; the root attributes of its file."""
+    """Where an artifact comes from; the root attributes of its file.
+
+    ``images`` is the image folder, of the index alone: no reader compares it, as no result depends on it.
+    """
 
     stage: str
     stage_version: int
     scene: str
     options: str = "{}"
     settings: str = ""
+    images: str = ""
 
 
 def column(shape: str, dtype: str, description: str) -> Any:
@@ -114,6 +118,8 @@ class Artifact:
             file.attrs["scene"] = header.scene
             file.attrs["options"] = header.options
             file.attrs["settings"] = header.settings
+            if header.images:
+                file.attrs["images"] = header.images
             file.attrs["software"] = f"snakesfm {snakesfm.__version__}"
             file.attrs["checksum"] = checksum(
                 getattr(self, field.name) for field in dataclasses.fields(self)

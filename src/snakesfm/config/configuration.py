@@ -4,6 +4,7 @@ import datetime
 import difflib
 import functools
 import importlib
+import os
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -125,7 +126,7 @@ class RunOptions(SceneInputs):
     front_end: FrontEndName = ""
     """Detector and matcher by one name; empty uses the methods set in extract_features and match_pairs."""
     weights: str = "weights"
-    """Folder (or one file) of network weights, filled by 'snakemake fetch_weights'; jobs never download."""
+    """Folder (or one file) of network weights, filled by target 'fetch_weights'; jobs never download."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """Device for networks: 'auto' uses CUDA if available, 'cpu' never does, 'cuda' fails without it."""
     batch_size: Annotated[int, Field(ge=1, le=256)] | Literal["auto"] = "auto"
@@ -282,8 +283,8 @@ def _keys_beside(cls: type[BaseModel], path: list[str]) -> list[str]:
 
 
 def scene_name(images: str) -> str:
-    """The name of a scene: its folder's, or its parent's where the folder is called 'images'."""
-    folder = Path(images).expanduser().resolve()
+    """The name of a scene: its folder's as given, or its parent's where the folder is called 'images'."""
+    folder = Path(os.path.abspath(Path(images).expanduser()))  # noqa: PTH100 - resolve() follows links
     return folder.parent.name if folder.name.lower() == "images" else folder.name
 
 

@@ -21,6 +21,7 @@ UNREAD_SUFFIXES = (
     *(".avif", ".heic", ".heif", ".jxl"),
     *(".arw", ".cr2", ".cr3", ".dng", ".nef", ".orf", ".raf", ".rw2"),
 )
+VIDEO_SUFFIXES = (".avi", ".mkv", ".mov", ".mp4")
 MASK_DIGESTS_NAME = "mask_digests.json"
 CACHE_VERSION = 2
 # a file that was written so shortly before may change again within one tick of the file system's clock
@@ -64,6 +65,11 @@ def list_photographs(folder: Path | str) -> tuple[list[str], list[str]]:
     return images, [name for name in others if PurePosixPath(name).with_suffix("") not in read]
 
 
+def list_videos(folder: Path | str) -> list[str]:
+    """The video files of a folder at any depth, as :func:`list_images` lists images."""
+    return sorted(_walk(Path(folder), "", frozenset(), VIDEO_SUFFIXES))
+
+
 def count_images(folder: Path | str, limit: int | None = None) -> int:
     """Number of image files of a folder at any depth, counted up to ``limit`` where one is given.
 
@@ -72,6 +78,11 @@ def count_images(folder: Path | str, limit: int | None = None) -> int:
     ConfigError : the folder, or one inside it, cannot be listed.
     """
     return sum(1 for _ in islice(walk_images(folder), limit))
+
+
+def resolved_name(folder: Path) -> str:
+    """A folder's absolute path without links, for an artifact: what is no UTF-8 is escaped."""
+    return str(folder.resolve()).encode("utf-8", "backslashreplace").decode()
 
 
 def fingerprint_images(folder: Path | str, cache_file: Path | str | None = None) -> str:

@@ -14,7 +14,7 @@ from snakesfm.blocks import deal_blocks
 from snakesfm.errors import ImageError, SceneError, UnreadableImageError
 from snakesfm.geometry.camera import cameras_to_columns
 from snakesfm.ingest.cameras import ImageCameras, Photograph, assign_cameras, warn_of_own_cameras
-from snakesfm.ingest.discover import digest_images, fingerprint, list_photographs
+from snakesfm.ingest.discover import digest_images, fingerprint, list_photographs, resolved_name
 from snakesfm.ingest.known import match_known_cameras, read_known_cameras
 from snakesfm.ingest.read import read_header
 from snakesfm.stages.job import StageJob
@@ -58,7 +58,8 @@ def run(job: StageJob) -> None:
     index = _to_index(photographs, [digests[p.name] for p in photographs], found, refused, warnings, job)
     # jobs are not told the content, for only the controller compares it
     told = {**job.settings, "content": fingerprint(digests)}
-    index.write(job.output, replace(job, settings=told).header)
+    header = replace(job, settings=told).header
+    index.write(job.output, replace(header, images=resolved_name(folder)))
     _report(index)
 
 

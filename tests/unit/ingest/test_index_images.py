@@ -1,8 +1,11 @@
+import os
+
 import numpy as np
 import pytest
 from PIL import ExifTags, Image
 from PIL.TiffImagePlugin import IFDRational
 
+from snakesfm.artifacts.base import read_header
 from snakesfm.artifacts.images import ImageIndex
 from snakesfm.blocks import deal_blocks
 from snakesfm.config.index_images import IndexImagesOptions
@@ -73,6 +76,17 @@ def test_same_bytes_whatever_the_threads(tmp_path, folder):
     index(tmp_path / "two", folder, threads=4)
     name = "results/scene/index_images/index.h5"
     assert (tmp_path / "one" / name).read_bytes() == (tmp_path / "two" / name).read_bytes()
+
+
+def test_the_header_names_the_image_folder_whatever_its_bytes(tmp_path):
+    odd = tmp_path / os.fsdecode(b"f\xfcr")
+    for seed in (1, 2):
+        draw(odd / f"{seed}.png", seed)
+    (tmp_path / "link").symlink_to(odd)
+    index(tmp_path, tmp_path / "link")
+    header = read_header(tmp_path / "results" / "scene" / "index_images" / "index.h5")
+    assert header["images"] == f"{tmp_path.resolve()}/f\\udcfcr"
+    assert str(odd) not in header["settings"]
 
 
 def test_known_cameras_and_options(tmp_path, folder):
