@@ -23,6 +23,12 @@ INLIER_SIGMAS = 3.0
 REFITS = 5
 # of the search for steps of altitude, as the model tilts less without them
 STEP_ROUNDS = 3
+# tangents of 0.1 and 0.3 degrees: what steps may turn a model by without further proof, the second where it
+# stood on one part between steps, as such a part tells the tilt less well
+LEAST_TURN = 0.00175
+PART_TURN = 0.00525
+# of the positions, that a model that stands on all parts agrees with
+LEAST_USUAL = 0.7
 LEAST_IMAGES = 4
 # of which a similarity is estimated
 MINIMAL_SAMPLE = 3
@@ -52,6 +58,12 @@ ALTITUDE_STEPS = (
     "heights in the model are those of the longest part between steps."
 )
 
+DOUBTFUL_STEPS = (
+    "The altitudes in EXIF seem to step at {places} (first '{first}'), but a drift of the barometer or a "
+    "bent model would look alike: they were left in, so the model may be tilted; crossing flight lines would "
+    "tell them apart."
+)
+
 
 @dataclass(frozen=True)
 class Georeference:
@@ -68,6 +80,8 @@ class Georeference:
         largest first; a wrong position beside a straight flight would make it look broad.
     altitude_steps : rows of the images from which on EXIF's altitudes are higher, and by how many metres;
         the similarity is of altitudes without these steps.
+    doubtful_steps : rows of the images where altitudes seem to step but were left as they are, because a
+        tilt or a drift looks much the same.
     upward : mean over these images of the upward part of ``downward_axes``, about -1 if upright.
     """
 
@@ -80,6 +94,7 @@ class Georeference:
     median_vertical_m: float
     spread_m: tuple[float, float, float]
     altitude_steps: tuple[tuple[int, float], ...]
+    doubtful_steps: tuple[int, ...]
     upward: float
 
     @property
@@ -116,7 +131,11 @@ class Georeference:
         }
 
     def step_warnings(self, names: Sequence[str]) -> list[str]:
-        """One sentence on the steps of altitude that were taken out, if any; ``names`` of all images."""
+        """One sentence on the steps of altitude, if any, with the ``names`` of all images."""
+        if self.doubtful_steps:
+            count = len(self.doubtful_steps)
+            places = f"{count} images" if count > 1 else "one image"
+            return [DOUBTFUL_STEPS.format(places=places, first=names[self.doubtful_steps[0]])]
         if not self.altitude_steps:
             return []
         steps = ", ".join(f"{metres:+.1f} m from '{names[row]}' on" for row, metres in self.altitude_steps)
@@ -173,7 +192,7 @@ def georeference(
     fit = _fit(centers[rows], places, seed)
     if fit is None:
         return None
-    fit, steps = _without_steps(fit, centers[rows], places, seed)
+    fit, steps, doubtful = _without_steps(fit, centers[rows], places, seed)
     places, offsets = fit.places[fit.inliers], fit.offsets[fit.inliers]
     spread = np.linalg.svd(places - places.mean(axis=0), compute_uv=False) / np.sqrt(len(places))
     return Georeference(
@@ -186,6 +205,7 @@ def georeference(
         float(np.median(np.abs(offsets[:, 2]))),
         (float(spread[0]), float(spread[1]), float(spread[2])),
         tuple((int(rows[place]), metres) for place, metres in steps),
+        tuple(int(rows[place]) for place, _ in doubtful),
         float(np.mean(downward[rows] @ fit.similarity.rotation[2])),
     )
 
@@ -218,22 +238,39 @@ def _fit(sources: Array, places: Array, seed: int) -> _Fit | None:
 
 def _without_steps(
     fit: _Fit, sources: Array, places: Array, seed: int
-) -> tuple[_Fit, list[tuple[int, float]]]:
-    """The fit to positions without steps of altitude, and the steps; the same fit where there are none."""
+) -> tuple[_Fit, list[tuple[int, float]], list[tuple[int, float]]]:
+    """The fit to positions without steps of altitude, the steps, and those left in as they are doubtful."""
     # loaded here, as models without GPS do without scipy
-    from snakesfm.export.altitude_steps import altitude_steps
+    from snakesfm.export.altitude_steps import altitude_steps, is_more_level
 
+    given = fit
     steps: list[tuple[int, float]] = []
     for _ in range(STEP_ROUNDS):
         centers = fit.similarity.transform_points(sources)
-        sideways = np.linalg.norm((centers - places)[:, :2], axis=1)
-        rows = np.flatnonzero(sideways <= _max_error(sideways))
+        rows = np.flatnonzero(_is_near_on_map(fit))
         found = [(int(rows[k]), metres) for k, metres in altitude_steps(centers[rows], places[rows, 2])]
         better = _fit(sources, _levelled(places, found), seed) if found else None
         if better is None or better.median_residual_m >= fit.median_residual_m:
             break
         fit, steps = better, found
-    return fit, steps
+    if not steps:
+        return fit, [], []
+    rows = np.flatnonzero(_is_near_on_map(given))
+    at = [(int(np.searchsorted(rows, place)), metres) for place, metres in steps]
+    centers = given.similarity.transform_points(sources)[rows]
+    up = given.similarity.rotation @ fit.similarity.rotation[2]
+    slope = up[:2] / up[2]
+    harmless = LEAST_TURN if given.inliers.mean() >= LEAST_USUAL else PART_TURN
+    if np.linalg.norm(slope) <= harmless or is_more_level(centers, places[rows, 2], at, slope):
+        return fit, steps, []
+    return given, [], steps
+
+
+def _is_near_on_map(fit: _Fit) -> Array:
+    """Positions (n,) bool that agree but for their altitude."""
+    sideways = np.linalg.norm(fit.offsets[:, :2], axis=1)
+    near: Array = sideways <= _max_error(sideways)
+    return near
 
 
 def _levelled(places: Array, steps: Sequence[tuple[int, float]]) -> Array:
