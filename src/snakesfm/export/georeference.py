@@ -1,7 +1,7 @@
 """Georeferencing of a model by the GPS positions in EXIF."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import PurePosixPath
 from typing import Any, NamedTuple
 
@@ -39,10 +39,17 @@ LEAST_SPREAD = 10.0
 LINE_RATIO = 0.05
 # half of what a model upside down has at least, be it of nadir, oblique or street-level photographs
 UPSIDE_DOWN = 0.5
+# times the median residual, where positions mirrored east-west fit worse, or else better, beyond doubt
+CLEARLY = 2.0
 
 UPSIDE_DOWN_REASON = (
     "the positions would turn the model upside down, as those in a wrong hemisphere do: correct "
-    "GPSLatitudeRef (N or S) and GPSLongitudeRef (E or W), without which they count as north and east"
+    "GPSLatitudeRef (N or S) and GPSLongitudeRef (E or W), without which they count as north and east; or "
+    "cameras look up or are mounted upside down: then set georeference: true"
+)
+MIRRORED_REASON = (
+    "the positions are mirrored, as those in a wrong hemisphere are: correct GPSLatitudeRef (N or S) and "
+    "GPSLongitudeRef (E or W), without which they count as north and east"
 )
 DISAGREE_REASON = "only {inliers} of {images} positions agree with the model"
 LINE_REASON = (
@@ -58,10 +65,18 @@ ALTITUDE_STEPS = (
     "heights in the model are those of the longest part between steps."
 )
 
+UPRIGHT = (
+    "Cameras seem to look up or to be mounted upside down, as the GPS positions in EXIF say: check that z "
+    "is up in the model."
+)
+FEW_AGREE = (
+    "Only {inliers} of {images} GPS positions in EXIF agree with the model, which is placed by these: "
+    "check the others, e.g. for altitudes that step from flight to flight."
+)
 DOUBTFUL_STEPS = (
     "The altitudes in EXIF seem to step at {places} (first '{first}'), but a drift of the barometer or a "
-    "bent model would look alike: they were left in, so the model may be tilted; crossing flight lines would "
-    "tell them apart."
+    "bent model would look alike: they were left in, so the model may be tilted; crossing flight lines "
+    "would tell them apart."
 )
 
 
@@ -83,6 +98,8 @@ class Georeference:
     doubtful_steps : rows of the images where altitudes seem to step but were left as they are, because a
         tilt or a drift looks much the same.
     upward : mean over these images of the upward part of ``downward_axes``, about -1 if upright.
+    mirrored_ratio : of the median residuals of all positions mirrored east-west and as they are; 1 where
+        they fit equally, as in a plane, and where there is no need to know.
     """
 
     origin: Origin
@@ -96,11 +113,14 @@ class Georeference:
     altitude_steps: tuple[tuple[int, float], ...]
     doubtful_steps: tuple[int, ...]
     upward: float
+    mirrored_ratio: float = 1.0
 
     @property
     def refusal(self) -> str:
         """Why these positions do not tell where the model is, a clause; empty where they do."""
         longer, shorter, _ = self.spread_m
+        if self.mirrored_ratio < 1.0 / CLEARLY:
+            return MIRRORED_REASON
         if self.inliers < max(LEAST_IMAGES, LEAST_INLIERS * self.images):
             return DISAGREE_REASON.format(inliers=self.inliers, images=self.images)
         if shorter < LEAST_SPREAD * self.median_residual_m:
@@ -108,7 +128,7 @@ class Georeference:
                 return LINE_REASON
             return SPREAD_REASON.format(longer=longer, shorter=shorter, residual=self.median_residual_m)
         # positions mirrored by a wrong hemisphere fit cameras in a plane just as well, turned over
-        return UPSIDE_DOWN_REASON if self.upward > UPSIDE_DOWN else ""
+        return UPSIDE_DOWN_REASON if self.upward > UPSIDE_DOWN and self.mirrored_ratio <= CLEARLY else ""
 
     @property
     def trusted(self) -> bool:
@@ -130,8 +150,16 @@ class Georeference:
             ],
         }
 
-    def step_warnings(self, names: Sequence[str]) -> list[str]:
-        """One sentence on the steps of altitude, if any, with the ``names`` of all images."""
+    def warnings(self, names: Sequence[str]) -> list[str]:
+        """Sentences on what is unusual though positions are trusted, with the ``names`` of all images."""
+        warnings = self._step_warnings(names)
+        if self.trusted and self.inliers < LEAST_USUAL * self.images:
+            warnings.append(FEW_AGREE.format(inliers=self.inliers, images=self.images))
+        if self.trusted and self.upward > UPSIDE_DOWN:
+            warnings.append(UPRIGHT)
+        return warnings
+
+    def _step_warnings(self, names: Sequence[str]) -> list[str]:
         if self.doubtful_steps:
             count = len(self.doubtful_steps)
             places = f"{count} images" if count > 1 else "one image"
@@ -195,7 +223,7 @@ def georeference(
     fit, steps, doubtful = _without_steps(fit, centers[rows], places, seed)
     places, offsets = fit.places[fit.inliers], fit.offsets[fit.inliers]
     spread = np.linalg.svd(places - places.mean(axis=0), compute_uv=False) / np.sqrt(len(places))
-    return Georeference(
+    found = Georeference(
         origin,
         fit.similarity,
         len(rows),
@@ -207,6 +235,9 @@ def georeference(
         tuple((int(rows[place]), metres) for place, metres in steps),
         tuple(int(rows[place]) for place, _ in doubtful),
         float(np.mean(downward[rows] @ fit.similarity.rotation[2])),
+    )
+    return (
+        found if found.trusted else replace(found, mirrored_ratio=_mirrored_ratio(fit, centers[rows], seed))
     )
 
 
@@ -234,6 +265,19 @@ def _fit(sources: Array, places: Array, seed: int) -> _Fit | None:
         found = _to_similarity(pycolmap.estimate_sim3d(sources[fit.inliers], places[fit.inliers]))
         fit = None if found is None else _Fit(found, *_left(found, sources, places))
     return fit
+
+
+def _mirrored_ratio(fit: _Fit, sources: Array, seed: int) -> float:
+    """How many times farther positions are from the model mirrored east-west; 1 if most agree with neither.
+
+    Mirrored north-south, they are the same but for a turn.
+    """
+    mirrored = _fit(sources, fit.places * [-1.0, 1.0, 1.0], seed)
+    if mirrored is None:
+        return np.inf
+    ratio = mirrored.median_residual_m / max(fit.median_residual_m, 1e-6)
+    better = mirrored if ratio < 1.0 else fit
+    return ratio if better.inliers.mean() >= LEAST_INLIERS else 1.0
 
 
 def _without_steps(

@@ -102,7 +102,7 @@ def test_a_model_is_level_though_the_second_battery_starts_at_another_altitude(h
     (step,) = found.summary(names)["altitude_steps"]
     assert step["from_image"] == "day 9/DJI_35.JPG"
     assert step["metres"] == pytest.approx(height, abs=0.6)
-    (sentence,) = found.step_warnings(names)
+    (sentence,) = found.warnings(names)
     assert f"{step['metres']:+.1f} m from 'day 9/DJI_35.JPG' on" in sentence
     # heights are those of the first 35, the longer part
     moved = found.local_from_model.transform_points(sources)[:, 2] + found.origin[2]
@@ -196,5 +196,5 @@ def test_steps_that_may_be_a_drift_or_a_bent_model_are_left_in_and_told(make, se
     assert after == pytest.approx(before, abs=0.01)
     assert found.altitude_steps == () and 1 <= len(found.doubtful_steps) <= 10
     names = [f"DJI_{row}.JPG" for row in range(1000)]
-    (sentence,) = found.step_warnings(names)
+    (sentence,) = found.warnings(names)
     assert f"(first 'DJI_{found.doubtful_steps[0]}.JPG')" in sentence and "may be tilted" in sentence
