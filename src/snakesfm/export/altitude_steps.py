@@ -14,7 +14,7 @@ from snakesfm.geometry.robust import robust_sigma
 LEAST_STEP_M = 3.0
 # of a step found by chance, at any of the places where there could be one
 MOST_PROBABILITY = 0.05
-MOST_STEPS = 10
+MOST_STEPS = 40
 # images on either side of a step that must show it: enough of them, and not so many that drift counts
 LEAST_SIDE = 5
 SIDE = 15
@@ -25,6 +25,16 @@ LEAST_JUMP_SIGMAS = 6.0
 # of how far images differ from their neighbours, and in metres: what one errs by alone
 OUTLIER_SIGMAS = 5.0
 OUTLIER_M = 10.0
+# images between knots of a drift, and how many knots at most
+KNOT_IMAGES = 30
+MOST_KNOTS = 100
+# parts of a flight of which each errs on its own, from which the uncertainty of a slope is estimated
+LEAST_PARTS = 12
+# of the search for altitudes that no step or drift explains
+TRIMS = 3
+TRIM_SIGMAS = 4.0
+# of its standard deviations, by which a slope must be nearer to one than to another
+SURE_SIGMAS = 2.5
 
 
 def altitude_steps(centers: Array, altitudes: Array) -> list[tuple[int, float]]:
@@ -62,9 +72,66 @@ def altitude_steps(centers: Array, altitudes: Array) -> list[tuple[int, float]]:
         shown = jumps * np.sign(heights) >= np.maximum(least, LEAST_JUMP * np.abs(heights))
         doubtful = np.flatnonzero(~shown | (np.abs(heights) < least))
         if not len(doubtful):
-            return [(int(rows[place]), float(height)) for place, height in zip(steps, heights, strict=True)]
+            # where a step was missed, least squares bend the heights of the others
+            return [(int(rows[place]), float(jump)) for place, jump in zip(steps, jumps, strict=True)]
         del steps[doubtful[np.argmin(np.abs(heights[doubtful]))]]
     return []
+
+
+def is_more_level(
+    centers: Array, altitudes: Array, steps: Sequence[tuple[int, float]], slope: Array
+) -> bool:
+    """Whether a model is surely less tilted once it has been turned by a slope.
+
+    To a flight to and fro, steps and a tilt across its lines look alike, but from one line to the next
+    a tilt shows at once and a drift does not. So the tilt is estimated beside a drift that may bend every
+    few images and steps of any height.
+
+    Parameters
+    ----------
+    centers, altitudes : as of :func:`altitude_steps`.
+    steps : their images and heights.
+    slope : (2,) metres that the turned model is higher per metre along the first and the second axis.
+    """
+    places = [place for place, _ in steps]
+    nearer, sigma = _nearness(centers, altitudes, slope, places)
+    # where a bent model looks like steps, their columns hide the lines that speak against them
+    return nearer > SURE_SIGMAS * sigma and _nearness(centers, altitudes, slope, [])[0] > 0.0
+
+
+def _nearness(centers: Array, altitudes: Array, slope: Array, places: Sequence[int]) -> tuple[float, float]:
+    """How much nearer the tilt beside a drift and steps is to a slope than to none, and how sure that is.
+
+    The first is positive where it is nearer, the second its standard deviation.
+    """
+    deviations = altitudes - centers[:, 2]
+    columns = _with_steps(_bending(len(centers)), places)
+    rows = np.flatnonzero(_has_like(deviations))
+    for _ in range(TRIMS):
+        # of columns that are alike once images are left out, only what they span
+        basis, sizes, _ = np.linalg.svd(columns[rows], full_matrices=False)
+        basis = basis[:, sizes > 1e-9 * sizes[0]]
+        left = np.column_stack([centers[rows, :2], deviations[rows]])
+        left -= basis @ (basis.T @ left)
+        found = np.linalg.lstsq(left[:, :2], left[:, 2])[0]
+        residuals = left[:, 2] - left[:, :2] @ found
+        kept = np.abs(residuals) <= TRIM_SIGMAS * robust_sigma(residuals, 1e-6)
+        if kept.all():
+            break
+        rows = rows[kept]
+    # from the middle between the two
+    nearer = float((found - slope / 2.0) @ slope)
+    shares = residuals * (np.linalg.pinv(left[:, :2]).T @ slope)
+    parts = np.array_split(shares, max(LEAST_PARTS, len(shares) // KNOT_IMAGES))
+    return nearer, float(np.sqrt(sum(part.sum() ** 2 for part in parts)))
+
+
+def _bending(count: int) -> Array:
+    """Columns (count,c) whose sums are the drifts that bend at knots only."""
+    knots = np.linspace(0, count - 1, 2 + min(count // KNOT_IMAGES, MOST_KNOTS))
+    spacing = knots[1] - knots[0]
+    bending: Array = np.maximum(1.0 - np.abs(np.arange(count)[:, None] - knots) / spacing, 0.0)
+    return bending
 
 
 def _has_like(deviations: Array) -> Array:

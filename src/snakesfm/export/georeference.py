@@ -1,7 +1,7 @@
 """Georeferencing of a model by the GPS positions in EXIF."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import PurePosixPath
 from typing import Any, NamedTuple
 
@@ -23,6 +23,12 @@ INLIER_SIGMAS = 3.0
 REFITS = 5
 # of the search for steps of altitude, as the model tilts less without them
 STEP_ROUNDS = 3
+# tangents of 0.1 and 0.3 degrees: what steps may turn a model by without further proof, the second where it
+# stood on one part between steps, as such a part tells the tilt less well
+LEAST_TURN = 0.00175
+PART_TURN = 0.00525
+# of the positions, that a model that stands on all parts agrees with
+LEAST_USUAL = 0.7
 LEAST_IMAGES = 4
 # of which a similarity is estimated
 MINIMAL_SAMPLE = 3
@@ -33,10 +39,17 @@ LEAST_SPREAD = 10.0
 LINE_RATIO = 0.05
 # half of what a model upside down has at least, be it of nadir, oblique or street-level photographs
 UPSIDE_DOWN = 0.5
+# times the median residual, where positions mirrored east-west fit worse, or else better, beyond doubt
+CLEARLY = 2.0
 
 UPSIDE_DOWN_REASON = (
     "the positions would turn the model upside down, as those in a wrong hemisphere do: correct "
-    "GPSLatitudeRef (N or S) and GPSLongitudeRef (E or W), without which they count as north and east"
+    "GPSLatitudeRef (N or S) and GPSLongitudeRef (E or W), without which they count as north and east; or "
+    "cameras look up or are mounted upside down: then set georeference: true"
+)
+MIRRORED_REASON = (
+    "the positions are mirrored, as those in a wrong hemisphere are: correct GPSLatitudeRef (N or S) and "
+    "GPSLongitudeRef (E or W), without which they count as north and east"
 )
 DISAGREE_REASON = "only {inliers} of {images} positions agree with the model"
 LINE_REASON = (
@@ -50,6 +63,20 @@ SPREAD_REASON = (
 ALTITUDE_STEPS = (
     "The altitudes in EXIF step by {steps}, as where a barometer starts anew: the steps were taken out, so "
     "heights in the model are those of the longest part between steps."
+)
+
+UPRIGHT = (
+    "Cameras seem to look up or to be mounted upside down, as the GPS positions in EXIF say: check that z "
+    "is up in the model."
+)
+FEW_AGREE = (
+    "Only {inliers} of {images} GPS positions in EXIF agree with the model, which is placed by these: "
+    "check the others, e.g. for altitudes that step from flight to flight."
+)
+DOUBTFUL_STEPS = (
+    "The altitudes in EXIF seem to step at {places} (first '{first}'), but a drift of the barometer or a "
+    "bent model would look alike: they were left in, so the model may be tilted; crossing flight lines "
+    "would tell them apart."
 )
 
 
@@ -68,7 +95,11 @@ class Georeference:
         largest first; a wrong position beside a straight flight would make it look broad.
     altitude_steps : rows of the images from which on EXIF's altitudes are higher, and by how many metres;
         the similarity is of altitudes without these steps.
+    doubtful_steps : rows of the images where altitudes seem to step but were left as they are, because a
+        tilt or a drift looks much the same.
     upward : mean over these images of the upward part of ``downward_axes``, about -1 if upright.
+    mirrored_ratio : of the median residuals of all positions mirrored east-west and as they are; 1 where
+        they fit equally, as in a plane, and where there is no need to know.
     """
 
     origin: Origin
@@ -80,12 +111,16 @@ class Georeference:
     median_vertical_m: float
     spread_m: tuple[float, float, float]
     altitude_steps: tuple[tuple[int, float], ...]
+    doubtful_steps: tuple[int, ...]
     upward: float
+    mirrored_ratio: float = 1.0
 
     @property
     def refusal(self) -> str:
         """Why these positions do not tell where the model is, a clause; empty where they do."""
         longer, shorter, _ = self.spread_m
+        if self.mirrored_ratio < 1.0 / CLEARLY:
+            return MIRRORED_REASON
         if self.inliers < max(LEAST_IMAGES, LEAST_INLIERS * self.images):
             return DISAGREE_REASON.format(inliers=self.inliers, images=self.images)
         if shorter < LEAST_SPREAD * self.median_residual_m:
@@ -93,7 +128,7 @@ class Georeference:
                 return LINE_REASON
             return SPREAD_REASON.format(longer=longer, shorter=shorter, residual=self.median_residual_m)
         # positions mirrored by a wrong hemisphere fit cameras in a plane just as well, turned over
-        return UPSIDE_DOWN_REASON if self.upward > UPSIDE_DOWN else ""
+        return UPSIDE_DOWN_REASON if self.upward > UPSIDE_DOWN and self.mirrored_ratio <= CLEARLY else ""
 
     @property
     def trusted(self) -> bool:
@@ -115,8 +150,20 @@ class Georeference:
             ],
         }
 
-    def step_warnings(self, names: Sequence[str]) -> list[str]:
-        """One sentence on the steps of altitude that were taken out, if any; ``names`` of all images."""
+    def warnings(self, names: Sequence[str]) -> list[str]:
+        """Sentences on what is unusual though positions are trusted, with the ``names`` of all images."""
+        warnings = self._step_warnings(names)
+        if self.trusted and self.inliers < LEAST_USUAL * self.images:
+            warnings.append(FEW_AGREE.format(inliers=self.inliers, images=self.images))
+        if self.trusted and self.upward > UPSIDE_DOWN:
+            warnings.append(UPRIGHT)
+        return warnings
+
+    def _step_warnings(self, names: Sequence[str]) -> list[str]:
+        if self.doubtful_steps:
+            count = len(self.doubtful_steps)
+            places = f"{count} images" if count > 1 else "one image"
+            return [DOUBTFUL_STEPS.format(places=places, first=names[self.doubtful_steps[0]])]
         if not self.altitude_steps:
             return []
         steps = ", ".join(f"{metres:+.1f} m from '{names[row]}' on" for row, metres in self.altitude_steps)
@@ -173,10 +220,10 @@ def georeference(
     fit = _fit(centers[rows], places, seed)
     if fit is None:
         return None
-    fit, steps = _without_steps(fit, centers[rows], places, seed)
+    fit, steps, doubtful = _without_steps(fit, centers[rows], places, seed)
     places, offsets = fit.places[fit.inliers], fit.offsets[fit.inliers]
     spread = np.linalg.svd(places - places.mean(axis=0), compute_uv=False) / np.sqrt(len(places))
-    return Georeference(
+    found = Georeference(
         origin,
         fit.similarity,
         len(rows),
@@ -186,7 +233,11 @@ def georeference(
         float(np.median(np.abs(offsets[:, 2]))),
         (float(spread[0]), float(spread[1]), float(spread[2])),
         tuple((int(rows[place]), metres) for place, metres in steps),
+        tuple(int(rows[place]) for place, _ in doubtful),
         float(np.mean(downward[rows] @ fit.similarity.rotation[2])),
+    )
+    return (
+        found if found.trusted else replace(found, mirrored_ratio=_mirrored_ratio(fit, centers[rows], seed))
     )
 
 
@@ -216,24 +267,54 @@ def _fit(sources: Array, places: Array, seed: int) -> _Fit | None:
     return fit
 
 
+def _mirrored_ratio(fit: _Fit, sources: Array, seed: int) -> float:
+    """How many times farther positions are from the model mirrored east-west; 1 if most agree with neither.
+
+    Mirrored north-south, they are the same but for a turn.
+    """
+    mirrored = _fit(sources, fit.places * [-1.0, 1.0, 1.0], seed)
+    if mirrored is None:
+        return np.inf
+    ratio = mirrored.median_residual_m / max(fit.median_residual_m, 1e-6)
+    better = mirrored if ratio < 1.0 else fit
+    return ratio if better.inliers.mean() >= LEAST_INLIERS else 1.0
+
+
 def _without_steps(
     fit: _Fit, sources: Array, places: Array, seed: int
-) -> tuple[_Fit, list[tuple[int, float]]]:
-    """The fit to positions without steps of altitude, and the steps; the same fit where there are none."""
+) -> tuple[_Fit, list[tuple[int, float]], list[tuple[int, float]]]:
+    """The fit to positions without steps of altitude, the steps, and those left in as they are doubtful."""
     # loaded here, as models without GPS do without scipy
-    from snakesfm.export.altitude_steps import altitude_steps
+    from snakesfm.export.altitude_steps import altitude_steps, is_more_level
 
+    given = fit
     steps: list[tuple[int, float]] = []
     for _ in range(STEP_ROUNDS):
         centers = fit.similarity.transform_points(sources)
-        sideways = np.linalg.norm((centers - places)[:, :2], axis=1)
-        rows = np.flatnonzero(sideways <= _max_error(sideways))
+        rows = np.flatnonzero(_is_near_on_map(fit))
         found = [(int(rows[k]), metres) for k, metres in altitude_steps(centers[rows], places[rows, 2])]
         better = _fit(sources, _levelled(places, found), seed) if found else None
         if better is None or better.median_residual_m >= fit.median_residual_m:
             break
         fit, steps = better, found
-    return fit, steps
+    if not steps:
+        return fit, [], []
+    rows = np.flatnonzero(_is_near_on_map(given))
+    at = [(int(np.searchsorted(rows, place)), metres) for place, metres in steps]
+    centers = given.similarity.transform_points(sources)[rows]
+    up = given.similarity.rotation @ fit.similarity.rotation[2]
+    slope = up[:2] / up[2]
+    harmless = LEAST_TURN if given.inliers.mean() >= LEAST_USUAL else PART_TURN
+    if np.linalg.norm(slope) <= harmless or is_more_level(centers, places[rows, 2], at, slope):
+        return fit, steps, []
+    return given, [], steps
+
+
+def _is_near_on_map(fit: _Fit) -> Array:
+    """Positions (n,) bool that agree but for their altitude."""
+    sideways = np.linalg.norm(fit.offsets[:, :2], axis=1)
+    near: Array = sideways <= _max_error(sideways)
+    return near
 
 
 def _levelled(places: Array, steps: Sequence[tuple[int, float]]) -> Array:

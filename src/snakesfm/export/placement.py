@@ -87,7 +87,7 @@ def placement_warnings(placements: Sequence[Placement], names: Sequence[str], is
     for number, (place, doubt) in enumerate((each.place, each.doubt) for each in placements):
         model = f"sparse/{number}" if number else "the model"
         if place is not None:
-            warnings += place.step_warnings(names)
+            warnings += place.warnings(names)
         if doubt and place is not None:
             warnings.append(UNTRUSTED.format(model=model, reason=doubt))
         elif doubt and number == 0:

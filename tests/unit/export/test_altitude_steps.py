@@ -1,22 +1,29 @@
 """Steps in altitudes, as of barometers that start anew with every battery."""
 
+from dataclasses import dataclass
+
 import numpy as np
 import pycolmap
 import pytest
 from scipy.spatial.transform import Rotation
 
 from snakesfm.export.altitude_steps import altitude_steps
-from snakesfm.export.georeference import georeference, taking_order
+from snakesfm.export.georeference import STEP_ROUNDS, Georeference, georeference, taking_order
 from snakesfm.geometry.earth import local_origin
 
 ORIGIN = (41.0, -83.0, 300.0)
 
 
-def flight(rng: np.random.Generator, rows: int = 7) -> np.ndarray:
-    """Centres (9 rows,3) in metres along lines that are flown to and fro."""
-    x, y = np.meshgrid(25.0 * np.arange(9), 30.0 * np.arange(rows))
+def grid(columns: int, lines: int) -> np.ndarray:
+    """Centres (columns lines,3) in metres along lines that are flown to and fro."""
+    x, y = np.meshgrid(25.0 * np.arange(columns), 30.0 * np.arange(lines))
     x[1::2] = x[1::2, ::-1]
-    return np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)]) + rng.normal(size=(x.size, 3)) * 0.5
+    return np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)])
+
+
+def flight(rng: np.random.Generator) -> np.ndarray:
+    """Centres (63,3) of seven lines."""
+    return grid(9, 7) + rng.normal(size=(63, 3)) * 0.5
 
 
 def tilted(centers: np.ndarray, degrees: float) -> np.ndarray:
@@ -95,8 +102,99 @@ def test_a_model_is_level_though_the_second_battery_starts_at_another_altitude(h
     (step,) = found.summary(names)["altitude_steps"]
     assert step["from_image"] == "day 9/DJI_35.JPG"
     assert step["metres"] == pytest.approx(height, abs=0.6)
-    (sentence,) = found.step_warnings(names)
+    (sentence,) = found.warnings(names)
     assert f"{step['metres']:+.1f} m from 'day 9/DJI_35.JPG' on" in sentence
     # heights are those of the first 35, the longer part
     moved = found.local_from_model.transform_points(sources)[:, 2] + found.origin[2]
     np.testing.assert_allclose(np.median(moved), ORIGIN[2], atol=0.5)
+
+
+@dataclass(frozen=True)
+class Survey:
+    """Centres and altitudes of a grid of lines, each in metres, and what the model makes of the centres."""
+
+    local: np.ndarray
+    model: np.ndarray
+    errors: np.ndarray
+
+
+def batteries(
+    rng: np.random.Generator, count: int, images: int, sigma: float, drift: float = 0.0
+) -> Survey:
+    """A survey in which each battery starts at an altitude of its own and drifts by as much as the others."""
+    lines = round(images**0.5)
+    local = grid(images // lines, lines) + rng.normal(size=(images // lines * lines, 3)) * 0.5
+    ends = np.linspace(0, len(local), count + 1).astype(int)
+    errors = rng.normal(size=local.shape) * [0.5, 0.5, 0.3]
+    for start, end, offset in zip(ends, ends[1:], rng.normal(size=count) * sigma, strict=False):
+        errors[start:end, 2] += offset + drift * np.linspace(0.0, 1.0, end - start)
+    return Survey(local, local, errors)
+
+
+def waves(rng: np.random.Generator, periods: int, amplitude: float) -> Survey:
+    """A model of level lines that is bent across them."""
+    local = grid(20, 10) + rng.normal(size=(200, 3)) * 0.5
+    phase = local[:, 1] / np.ptp(local[:, 1]) * 2.0 * np.pi * periods
+    bent = local + np.sin(phase)[:, None] * [0.0, 0.0, amplitude]
+    return Survey(local, bent, rng.normal(size=local.shape) * [0.5, 0.5, 0.3])
+
+
+def tilts(survey: Survey, monkeypatch: pytest.MonkeyPatch) -> tuple[float, float, Georeference]:
+    """Degrees by which the georeferenced model leans, before and after the search for steps; and its result."""
+    turn = Rotation.random(random_state=1).as_matrix()
+    gps = pycolmap.GPSTransform().enu_to_ellipsoid(survey.local + survey.errors, *ORIGIN)
+    leans = []
+    for rounds in (0, STEP_ROUNDS):
+        monkeypatch.setattr("snakesfm.export.georeference.STEP_ROUNDS", rounds)
+        rows = np.arange(len(gps))
+        found = georeference(
+            0.1 * survey.model @ turn, np.zeros((len(gps), 3)), gps, local_origin(gps), rows, 0
+        )
+        up = found.local_from_model.rotation @ turn.T @ [0.0, 0.0, 1.0]
+        leans.append(float(np.degrees(np.arccos(min(up[2], 1.0)))))
+    return leans[0], leans[1], found
+
+
+@pytest.mark.parametrize(
+    ("count", "images", "sigma", "least_gain"),
+    [
+        (2, 1000, 5.0, 0.3),
+        (4, 1000, 5.0, 0.3),
+        (8, 1000, 5.0, 0.0),
+        (8, 1000, 10.0, 0.5),
+        (12, 1000, 10.0, -0.02),
+        (16, 1000, 5.0, -0.02),
+        (16, 1000, 10.0, -0.02),
+    ],
+)
+def test_a_model_leans_no_more_without_the_steps_of_many_batteries(
+    count, images, sigma, least_gain, monkeypatch
+):
+    gains = []
+    for seed in range(8):
+        survey = batteries(np.random.default_rng(seed), count, images, sigma)
+        before, after, found = tilts(survey, monkeypatch)
+        assert after <= before + 0.1
+        assert not (found.altitude_steps and found.doubtful_steps)
+        gains.append(before - after)
+    assert least_gain <= np.mean(gains) < 1.5
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda rng: waves(rng, 1, 8.0),
+        lambda rng: waves(rng, 2, 6.0),
+        lambda rng: batteries(rng, 2, 200, 0.0, drift=15.0),
+        lambda rng: batteries(rng, 8, 1000, 0.0, drift=15.0),
+    ],
+    ids=["one wave", "two waves", "two drifts", "eight drifts"],
+)
+@pytest.mark.parametrize("seed", range(3))
+def test_steps_that_may_be_a_drift_or_a_bent_model_are_left_in_and_told(make, seed, monkeypatch):
+    before, after, found = tilts(make(np.random.default_rng(seed)), monkeypatch)
+    assert after == pytest.approx(before, abs=0.01)
+    assert found.altitude_steps == () and 1 <= len(found.doubtful_steps) <= 10
+    names = [f"DJI_{row}.JPG" for row in range(1000)]
+    (sentence,) = found.warnings(names)
+    assert f"(first 'DJI_{found.doubtful_steps[0]}.JPG')" in sentence and "may be tilted" in sentence

@@ -167,3 +167,45 @@ def test_a_majority_of_good_positions_is_told_from_a_receiver_that_froze(scatter
     assert 0.4 < found.median_residual_m < 1.5
     np.testing.assert_allclose(found.local_from_model.rotation @ turn.T, np.eye(3), atol=0.02)
     np.testing.assert_allclose(found.local_from_model.scale, 10.0, rtol=0.01)
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("relief_m", [0.0, 15.0])
+def test_cameras_upside_down_are_told_from_positions_in_the_wrong_hemisphere(relief_m, seed):
+    rng = np.random.default_rng(seed)
+    angle = np.linspace(0.0, 2.0 * np.pi, 120)
+    local = np.column_stack([150.0 * np.cos(angle), 100.0 * np.sin(angle), relief_m * np.sin(3.0 * angle)])
+    local += rng.normal(size=local.shape) * 0.1
+    turn = project_to_so3(rng.normal(size=(3, 3)))
+
+    def found(mirror: list[float], camera: np.ndarray) -> Georeference:
+        noisy = local * mirror + rng.normal(size=local.shape) * 0.3
+        gps = pycolmap.GPSTransform().enu_to_ellipsoid(noisy, *ORIGIN)
+        rotations = np.repeat((camera.T @ turn)[None], 120, axis=0)
+        return place(0.1 * local @ turn, gps, local_origin(gps), 0, rotations)
+
+    inverted = found([1.0, 1.0, 1.0], LEVEL @ np.diag([-1.0, -1.0, 1.0]))
+    assert inverted.inliers >= 115 and inverted.upward > 0.9
+    if relief_m:
+        assert inverted.trusted and 3.0 < inverted.mirrored_ratio < 100.0
+        (sentence,) = inverted.warnings([])
+        assert "mounted upside down" in sentence
+    else:
+        assert 0.7 < inverted.mirrored_ratio < 1.4 and inverted.warnings([]) == []
+        assert "GPSLongitudeRef" in inverted.refusal and "set georeference: true" in inverted.refusal
+    for mirror in ([-1.0, 1.0, 1.0], [1.0, -1.0, 1.0]):
+        wrong = found(mirror, LEVEL)
+        assert "GPSLongitudeRef" in wrong.refusal
+        assert ("georeference: true" in wrong.refusal) == (relief_m == 0.0)
+        assert (wrong.mirrored_ratio < 0.5) == (relief_m > 0.0) and wrong.mirrored_ratio < 1.4
+    right = found([1.0, 1.0, 1.0], LEVEL)
+    assert right.trusted and right.warnings([]) == []
+
+
+@pytest.mark.parametrize(("frozen", "warned"), [(0, False), (16, False), (30, True)])
+def test_a_model_placed_by_few_of_the_positions_is_told(frozen, warned):
+    centers, gps, _ = survey(count=80, noise_m=0.5)
+    gps[:frozen] = gps[0]
+    found = place(centers, gps, local_origin(gps), 0)
+    assert found.trusted and 78 - frozen <= found.inliers <= 81 - frozen
+    assert [f"Only {found.inliers} of 80" in line for line in found.warnings([])] == [True] * warned
