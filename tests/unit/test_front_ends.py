@@ -278,10 +278,12 @@ def test_masks_reach_extraction_and_export_and_their_content_counts(tmp_path: Pa
     (changed,) = plan_of(tmp_path, masks=str(masks)).scenes.values()
     told = [plan.settings("extract_features", wildcards, True) for plan in (scene, changed)]
     assert told[0]["masks"] == told[1]["masks"] and told[0]["masks_content"] != told[1]["masks_content"]
-    # a job on a cluster is not told the content, and its artifact must be known again all the same
+    # a job on a cluster is not told the content, which it finds and tells of in its artifact
     job = scene.settings("extract_features", wildcards, False)
-    assert settings_text(job, 0) == scene.settings_text("extract_features", Path("0.h5"))
-    assert settings_text(job, 0) != before.settings_text("extract_features", Path("0.h5"))
+    assert job["masks_content"] == ""
+    made = settings_text({**job, "masks_content": told[0]["masks_content"]}, 0)
+    expected = [plan.settings_text("extract_features", Path("0.h5")) for plan in (scene, changed, before)]
+    assert [made == text for text in expected] == [True, False, False]
 
 
 @pytest.mark.parametrize(
