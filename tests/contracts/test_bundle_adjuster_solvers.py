@@ -152,14 +152,6 @@ class BundleAdjusterContract:
 class TestCeres(BundleAdjusterContract):
     solver = "ceres"
 
-    def test_independent_of_threads(self, adjust):
-        results = []
-        for threads in (1, 2):
-            _, model, reconstruction = scene(noise_px=0.5)
-            adjust(reconstruction, SolverSettings(threads=threads))
-            results.append(from_reconstruction(reconstruction, model)[0])
-        np.testing.assert_array_equal(results[0].rotations, results[1].rotations)
-
 
 class TestGtsam(BundleAdjusterContract):
     solver = "gtsam"

@@ -70,7 +70,7 @@ def test_hlocs_files_go_out_and_come_in_again(finished, small_scene: Path, workf
     known = ["scene=square", "output=out", "front_end=imported", f"imported={folder}"]
     astray = again.run("--until", "extract_features", "--config", f"images={small_scene}", *known)
     assert astray.status == 0, astray.text
-    metrics = run(again, small_scene, "front_end=imported", f"imported={folder}")
+    metrics = run(again, small_scene, "scene=square", "front_end=imported", f"imported={folder}")
     assert metrics["reference_images_registered"] == 16
     before = json.loads((finished[0] / "evaluate_model" / "metrics.json").read_text())
     for degrees in ("1", "3", "5"):
