@@ -8,14 +8,14 @@ from pathlib import Path
 import yaml
 
 from snakesfm.errors import ConfigError
+from snakesfm.records import FLAGS
 
 # written in C, and 20 times as fast, where PyYAML was built with it
 LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 MERGE_TAG = "tag:yaml.org,2002:merge"
 
-# behind letters that take no value, the rest of a word is another option
 GIVEN_ONCE = {
-    "--config": (re.compile(r"--config(=.*)?|-[hntkfFlSDvpa]*C.*", re.DOTALL), "KEY=VALUE"),
+    "--config": (re.compile(rf"--config(=.*)?|-[{FLAGS}]*C.*", re.DOTALL), "KEY=VALUE"),
     "--configfile": (re.compile(r"--configfiles?(=.*)?", re.DOTALL), "files"),
 }
 

@@ -1,6 +1,6 @@
 """The files of an exported model, and the pictures beside them that no rule names."""
 
-from collections.abc import Iterable
+import os
 from pathlib import Path
 
 SUMMARY = "summary.json"
@@ -17,30 +17,22 @@ MODEL_FILES = (
 )
 
 
-def without_pictures(results: Iterable[str], link_images: bool, undistort: bool) -> list[Path]:
-    """Summaries of models beside which pictures are lost, or links lead nowhere, as where a project moved.
+def lacks_pictures(model: Path, link_images: bool, undistort: bool) -> bool:
+    """Whether pictures beside a model are lost, or links lead nowhere, as where a project moved.
 
     Snakemake does not see it, for the names of the pictures are no outputs.
 
     Parameters
     ----------
-    results : files that a run makes, summaries among them.
+    model : the folder of export_model.
     link_images, undistort : options of export_model.
     """
-    places = ["images"] if link_images or undistort else []
-    places += ["undistorted/images", "undistorted/sparse"] if undistort else []
-    return [
-        Path(result)
-        for result in results
-        if Path(result).name == SUMMARY and _lacks(Path(result).parent, places)
-    ]
-
-
-def _lacks(folder: Path, places: Iterable[str]) -> bool:
-    masks = folder / "masks"
-    return any(_leads_nowhere(folder / place) for place in places) or (
-        masks.is_symlink() and not masks.exists()
-    )
+    masks = model / "masks"
+    if masks.is_symlink() and not masks.exists():
+        return True
+    if undistort and not all((model / "undistorted" / part).is_dir() for part in ("images", "sparse")):
+        return True
+    return (link_images or undistort) and _leads_nowhere(model / "images")
 
 
 def _leads_nowhere(place: Path) -> bool:
@@ -49,5 +41,6 @@ def _leads_nowhere(place: Path) -> bool:
         return True
     if place.is_symlink():
         return False
-    link = next((path for path in place.rglob("*") if path.is_symlink()), None)
+    files = (Path(folder, name) for folder, _, names in os.walk(place) for name in names)
+    link = next((file for file in files if file.is_symlink()), None)
     return link is not None and not link.exists()

@@ -10,9 +10,10 @@ from pathlib import Path
 from snakesfm.errors import ConfigError
 
 RECORDS = Path(".snakemake", "metadata")
+# Snakemake's letters without a value: behind another, the rest of a word is one ('-call' is '--cores all')
+FLAGS = "hntkfFlSDvpa"
 MAKES_NOTHING = re.compile(
-    # behind a letter that takes a value, the rest is that value: '-call' is '--cores all'
-    r"-[hkfFvpa]*[nSDlt].*|"
+    rf"-[{FLAGS}]*[nSDlt].*|"
     r"--(dry-?run|touch|unlock|lint|report|archive|l[tipu]|list.*|summary|detailed-summary|dag|rulegraph|filegraph|"
     r"d3dag|cleanup-.*|delete-.*|containerize|generate-unit-tests|export-cwl|print-compilation)(=.*)?"
 )
@@ -21,7 +22,7 @@ MAKES_PART = frozenset(("--until", "-U", "--omit-from", "-O", "--drop-metadata")
 # an option that names rules, the first of them in the same word
 NAMES_RULES = re.compile(
     r"(--until|--omit-from|--forcerun|--prioritize|--allowed-rules|--preemptible-rules)=(.*)|"
-    r"-[hkfFvpa]*([UORP])(.*)"
+    rf"-[{FLAGS}]*([UORP])(.*)"
 )
 # the longest name of a file, less the mark of a part that goes on
 PART = 254

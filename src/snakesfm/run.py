@@ -15,7 +15,7 @@ from typing import Any
 from snakesfm import slurm
 from snakesfm.errors import ConfigError
 from snakesfm.job_logs import find_cost
-from snakesfm.model_files import without_pictures
+from snakesfm.model_files import SUMMARY, lacks_pictures
 from snakesfm.plan import Plan
 from snakesfm.records import MAKES_PART, forget, unrecorded_files, was_made_with
 from snakesfm.scene_plan import ScenePlan
@@ -59,8 +59,12 @@ class Run:
         with self._beside_no_other():
             for scene in self.plan.scenes.values():
                 results = () if asked & MAKES_PART else scene.results(asked)
+                outdated = unrecorded_files(results)
+                summary = scene.folder / "export_model" / SUMMARY
                 exporting = scene.options("export_model").model_dump(include={"link_images", "undistort"})
-                for path in [*unrecorded_files(results), *without_pictures(results, **exporting)]:
+                if str(summary) in results and lacks_pictures(summary.parent, **exporting):
+                    outdated.append(summary)
+                for path in outdated:
                     with contextlib.suppress(OSError):
                         forget(path)
                 unknown = unrecorded_files(scene.artifacts())
@@ -239,7 +243,7 @@ class Run:
 
     def _summary(self, scene: ScenePlan) -> dict[str, Any]:
         """What export_model says of the scene's model; empty where there is none of the present images."""
-        return self._read_result(scene, "export_model", "summary.json")
+        return self._read_result(scene, "export_model", SUMMARY)
 
     def _read_result(self, scene: ScenePlan, stage: str, name: str) -> dict[str, Any]:
         """A result in JSON; empty where it is missing or of former images or options."""
@@ -279,7 +283,7 @@ class Run:
         in_database = f"COLMAP database in {database}" if made else ""
         summary = self._summary(scene)
         if not summary:
-            is_former = (scene.folder / "export_model" / "summary.json").is_file()
+            is_former = (scene.folder / "export_model" / SUMMARY).is_file()
             older = "the model is older than its images or options: 'all' updates it"
             model = older if is_former else "no model yet"
             return f"snakesfm: scene '{scene.name}': {', '.join(filter(None, (in_database, model)))}."

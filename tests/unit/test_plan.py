@@ -157,6 +157,7 @@ def test_scenes_of_other_sizes_have_rules_of_their_own(tmp_path: Path) -> None:
         ("--until=select_pairs", True),
         ("-R match_pairs select_pairs", True),
         ("-kUselect_pairs", True),
+        ("-nRselect_pairs", True),
         ("--until select_pairs select_pairs_2_blocks", False),
         ("--until match_pairs --set-resources select_pairs:mem_mb=10 --set-threads select_pairs=1", False),
         ("--until select_pairs_2_blocks", False),

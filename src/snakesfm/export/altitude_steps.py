@@ -78,9 +78,7 @@ def altitude_steps(centers: Array, altitudes: Array) -> list[tuple[int, float]]:
     return []
 
 
-def is_more_level(
-    centers: Array, altitudes: Array, steps: Sequence[tuple[int, float]], slope: Array
-) -> bool:
+def is_more_level(centers: Array, altitudes: Array, places: Sequence[int], slope: Array) -> bool:
     """Whether a model is surely less tilted once it has been turned by a slope.
 
     To a flight to and fro, steps and a tilt across its lines look alike, but from one line to the next
@@ -90,10 +88,9 @@ def is_more_level(
     Parameters
     ----------
     centers, altitudes : as of :func:`altitude_steps`.
-    steps : their images and heights.
+    places : images at which altitudes step.
     slope : (2,) metres that the turned model is higher per metre along the first and the second axis.
     """
-    places = [place for place, _ in steps]
     nearer, sigma = _nearness(centers, altitudes, slope, places)
     # where a bent model looks like steps, their columns hide the lines that speak against them
     return nearer > SURE_SIGMAS * sigma and _nearness(centers, altitudes, slope, [])[0] > 0.0

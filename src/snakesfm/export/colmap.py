@@ -25,7 +25,7 @@ def build_reconstruction(
     offsets: Array,
     image_ids: Array,
     keypoints: Array,
-    others: tuple[Array, Sequence[Array]] | None = None,
+    all_keypoints: tuple[Array, Sequence[Array]] | None = None,
 ) -> pycolmap.Reconstruction:
     """A pycolmap reconstruction of the registered images.
 
@@ -39,7 +39,7 @@ def build_reconstruction(
     rotations, translations : (N,3,3), (N,3) cam_from_world; NaN where not registered.
     points, colors, errors_px : (T,3) float64, (T,3) uint8 RGB, (T,) mean reprojection error in pixels.
     offsets, image_ids, keypoints : (T+1,), (L,), (L,2): observations of the points, in original pixels.
-    others : the observation's row (L,) among the keypoints of its image, and per image all of these
+    all_keypoints : the observation's row (L,) among the keypoints of its image, and per image all of these
         (K_i,2), which become its points2D; the points2D of None are the observations in the order of the
         points.
 
@@ -57,12 +57,13 @@ def build_reconstruction(
     for row in registered.tolist():
         image = pycolmap.Image(name=names[row], camera_id=int(camera_ids[row]) + 1, image_id=row + 1)
         model.add_image_with_trivial_frame(image, to_rigid3d(rotations[row], translations[row]))
-    if others is None:
+    if all_keypoints is None:
         per_image, keypoint_ids = keypoints_of_observations(image_ids, keypoints, len(names))
     else:
-        keypoint_ids, per_image = others[0], [np.array(found, np.float64) for found in others[1]]
-        # what was observed was refined
+        keypoint_ids, per_image = all_keypoints[0], list(all_keypoints[1])
         for image, mine in rows_of_each(image_ids):
+            # what was observed was refined
+            per_image[image] = np.array(per_image[image], np.float64)
             per_image[image][keypoint_ids[mine]] = keypoints[mine]
     return with_observations(model, per_image, points, offsets, image_ids, keypoint_ids, colors, errors_px)
 

@@ -65,7 +65,7 @@ ALTITUDE_STEPS = (
     "heights in the model are those of the longest part between steps."
 )
 
-UPRIGHT = (
+INVERTED = (
     "Cameras seem to look up or to be mounted upside down, as the GPS positions in EXIF say: check that z "
     "is up in the model."
 )
@@ -156,7 +156,7 @@ class Georeference:
         if self.trusted and self.inliers < LEAST_USUAL * self.images:
             warnings.append(FEW_AGREE.format(inliers=self.inliers, images=self.images))
         if self.trusted and self.upward > UPSIDE_DOWN:
-            warnings.append(UPRIGHT)
+            warnings.append(INVERTED)
         return warnings
 
     def _step_warnings(self, names: Sequence[str]) -> list[str]:
@@ -233,7 +233,7 @@ def georeference(
         float(np.median(np.abs(offsets[:, 2]))),
         (float(spread[0]), float(spread[1]), float(spread[2])),
         tuple((int(rows[place]), metres) for place, metres in steps),
-        tuple(int(rows[place]) for place, _ in doubtful),
+        tuple(int(rows[place]) for place in doubtful),
         float(np.mean(downward[rows] @ fit.similarity.rotation[2])),
     )
     return (
@@ -257,13 +257,13 @@ class _Fit(NamedTuple):
 
 def _fit(sources: Array, places: Array, seed: int) -> _Fit | None:
     estimates = (_estimate(sources, places, error, seed) for error in ERRORS_M)
-    fits = [_Fit(found, *_left(found, sources, places)) for found in estimates if found is not None]
+    fits = [_fit_of(found, sources, places) for found in estimates if found is not None]
     fit = min(fits, key=lambda fit: fit.median_residual_m, default=None)
     for _ in range(REFITS):
         if fit is None or fit.inliers.sum() < MINIMAL_SAMPLE:
             return None
         found = _to_similarity(pycolmap.estimate_sim3d(sources[fit.inliers], places[fit.inliers]))
-        fit = None if found is None else _Fit(found, *_left(found, sources, places))
+        fit = None if found is None else _fit_of(found, sources, places)
     return fit
 
 
@@ -282,8 +282,8 @@ def _mirrored_ratio(fit: _Fit, sources: Array, seed: int) -> float:
 
 def _without_steps(
     fit: _Fit, sources: Array, places: Array, seed: int
-) -> tuple[_Fit, list[tuple[int, float]], list[tuple[int, float]]]:
-    """The fit to positions without steps of altitude, the steps, and those left in as they are doubtful."""
+) -> tuple[_Fit, list[tuple[int, float]], list[int]]:
+    """The fit to positions without steps of altitude, the steps, and where doubtful ones are left in."""
     # loaded here, as models without GPS do without scipy
     from snakesfm.export.altitude_steps import altitude_steps, is_more_level
 
@@ -300,14 +300,16 @@ def _without_steps(
     if not steps:
         return fit, [], []
     rows = np.flatnonzero(_is_near_on_map(given))
-    at = [(int(np.searchsorted(rows, place)), metres) for place, metres in steps]
+    doubtful = [place for place, _ in steps]
     centers = given.similarity.transform_points(sources)[rows]
     up = given.similarity.rotation @ fit.similarity.rotation[2]
     slope = up[:2] / up[2]
     harmless = LEAST_TURN if given.inliers.mean() >= LEAST_USUAL else PART_TURN
-    if np.linalg.norm(slope) <= harmless or is_more_level(centers, places[rows, 2], at, slope):
+    if np.linalg.norm(slope) <= harmless or is_more_level(
+        centers, places[rows, 2], np.searchsorted(rows, doubtful).tolist(), slope
+    ):
         return fit, steps, []
-    return given, [], steps
+    return given, [], doubtful
 
 
 def _is_near_on_map(fit: _Fit) -> Array:
@@ -340,11 +342,10 @@ def _to_similarity(found: pycolmap.Sim3d | None) -> Similarity | None:
     return Similarity(float(found.scale), found.rotation.matrix(), np.asarray(found.translation))
 
 
-def _left(found: Similarity, sources: Array, places: Array) -> tuple[Array, Array, Array]:
-    """The positions, and what a similarity leaves of them, as in :class:`_Fit`."""
+def _fit_of(found: Similarity, sources: Array, places: Array) -> _Fit:
     offsets = found.transform_points(sources) - places
     residuals = np.linalg.norm(offsets, axis=1)
-    return places, offsets, residuals <= _max_error(residuals)
+    return _Fit(found, places, offsets, residuals <= _max_error(residuals))
 
 
 def _max_error(residuals: Array) -> float:

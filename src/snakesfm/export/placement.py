@@ -20,8 +20,8 @@ from snakesfm.geometry.poses import center_of, has_pose, translation_of
 NO_GPS = "no image of the model has GPS in EXIF"
 FEW_POSITIONS = f"only {{count}} images of the model have GPS in EXIF, and {LEAST_IMAGES} are needed"
 NO_ALTITUDE = (
-    "{count} images of the model have GPS without altitude in EXIF, and fewer than four with it: write "
-    "GPSAltitude into EXIF"
+    "{count} images of the model have GPS without altitude in EXIF, and fewer than "
+    f"{LEAST_IMAGES} with it: write GPSAltitude into EXIF"
 )
 NO_SIMILARITY = "no four of the positions agree with the model"
 
@@ -84,14 +84,16 @@ def placement_summary(placements: Sequence[Placement], names: Sequence[str]) -> 
 def placement_warnings(placements: Sequence[Placement], names: Sequence[str], is_wanted: bool) -> list[str]:
     """Why the first model has no place, why places are not to be relied on, and steps of altitude."""
     warnings = []
-    for number, (place, doubt) in enumerate((each.place, each.doubt) for each in placements):
+    for number, each in enumerate(placements):
         model = f"sparse/{number}" if number else "the model"
-        if place is not None:
-            warnings += place.warnings(names)
-        if doubt and place is not None:
-            warnings.append(UNTRUSTED.format(model=model, reason=doubt))
-        elif doubt and number == 0:
-            warnings.append((WANTED if is_wanted else UNPLACED).format(reason=doubt))
+        if each.place is not None:
+            warnings += [
+                f"sparse/{number}: {line}" if number else line for line in each.place.warnings(names)
+            ]
+        if each.doubt and each.place is not None:
+            warnings.append(UNTRUSTED.format(model=model, reason=each.doubt))
+        elif each.doubt and number == 0:
+            warnings.append((WANTED if is_wanted else UNPLACED).format(reason=each.doubt))
     return warnings
 
 
@@ -129,13 +131,13 @@ def find_placement(
         return Placement(None, "")
     mine = gps[has_pose(rotations, translations)]
     on_map = np.isfinite(mine[:, :2]).all(axis=1)
-    in_space = int(np.isfinite(mine[on_map]).all(axis=1).sum())
+    in_space = int(np.isfinite(mine).all(axis=1).sum())
     count = int(on_map.sum())
     if not count:
         some = np.isfinite(gps[:, :2]).all(axis=1).any()
         return Placement(None, NO_GPS if some or wanted is True else "")
     if in_space < LEAST_IMAGES:
-        few = count < LEAST_IMAGES or count == in_space
+        few = count < LEAST_IMAGES
         return Placement(
             None, FEW_POSITIONS.format(count=count) if few else NO_ALTITUDE.format(count=count - in_space)
         )

@@ -17,10 +17,8 @@ class IndexedImages:
     folder : the image folder.
     """
 
-    def __init__(self, names: Array, sha256: Array, folder: Path) -> None:
-        self._names = names
-        self._sha256 = sha256
-        self._folder = folder
+    def __init__(self, names: Array, sha256: Array, folder: str | Path) -> None:
+        self._names, self._sha256, self._folder = names, sha256, Path(folder)
         self.damaged: dict[int, str] = {}
         """What is wrong with the images that could not be decoded, a sentence each, by row."""
 
@@ -36,11 +34,12 @@ class IndexedImages:
         ------
         SceneError : the file cannot be read now, or is another than when it was indexed.
         """
+        if row in self.damaged:
+            return None
         path = self._folder / str(self._names[row])
         try:
             return read_image(path, shorter_side_px, str(self._sha256[row]))
         except ImageError as error:
-            if row not in self.damaged:
-                print(f"warning: {error}", flush=True)
+            print(f"warning: {error}", flush=True)
             self.damaged[row] = str(error)
             return None

@@ -1,7 +1,6 @@
 """Stage adjust_bundle: cameras, poses and points adjusted together."""
 
 from dataclasses import replace
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -222,7 +221,7 @@ def _image_sources(job: StageJob, index: ImageIndex) -> list[ImageSource]:
 
     options: AdjustBundleOptions = job.options
     return open_image_sources(
-        IndexedImages(index.names, index.sha256, Path(job.settings["images"])).read,
+        IndexedImages(index.names, index.sha256, job.settings["images"]).read,
         index.sizes,
         detector_scales(index.sizes, job.settings),
         options.refine_finenesses,

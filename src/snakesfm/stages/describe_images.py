@@ -1,7 +1,6 @@
 """Compute a global descriptor for every image of one block."""
 
 import math
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -57,7 +56,7 @@ def _describe_pictures(job: StageJob, options: "DescribeImagesOptions") -> tuple
     descriptor = DESCRIPTORS[options.method](state=job.read_weights(options.method))
     side = descriptor.usual_side_px if options.longer_side_px == "auto" else options.longer_side_px
     described = np.zeros((len(image_ids), descriptor.size), np.float32)
-    images = IndexedImages(index.names, index.sha256, Path(job.settings["images"]))
+    images = IndexedImages(index.names, index.sha256, job.settings["images"])
     progress = job.progress(len(image_ids), "images")
     for rows in in_batches([tuple(size) for size in index.sizes[image_ids].tolist()], job.network_batch()):
         pictures = {}

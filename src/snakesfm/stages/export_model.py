@@ -26,6 +26,7 @@ from snakesfm.geometry.camera import Camera, cameras_from_columns
 from snakesfm.geometry.lens_fit import MAX_MISFIT, fit_lenses
 from snakesfm.geometry.poses import has_pose, to_camera
 from snakesfm.ingest.masks import masks_as_large
+from snakesfm.model_files import SUMMARY
 from snakesfm.stages.job import StageJob
 
 if TYPE_CHECKING:
@@ -33,7 +34,6 @@ if TYPE_CHECKING:
 
     from snakesfm.config.export_model import ExportModelOptions
 
-SUMMARY = "summary.json"
 UNDISTORTED = "undistorted"
 SPACES = (
     "Some image names contain spaces, where COLMAP cuts them when it reads images.txt: use the .bin files."
@@ -91,21 +91,18 @@ def run(job: StageJob) -> None:
     index = ImageIndex.read(job.path("index"))
     adjusted = Reconstruction.read(job.path("reconstruction"))
     names = [str(name) for name in index.names]
-    placements = [
-        _placement(job, index, adjusted.select_model(number))
-        for number in range(max(1, adjusted.model_count))
-    ]
+    placements = _placements(job, index, adjusted, names)
     model = _moved(adjusted.select_model(0), placements[0])
     cameras = cameras_from_columns(model.camera_models, model.camera_sizes, model.camera_params)
     registered = np.flatnonzero(has_pose(model.rotations, model.translations))
-    warnings = _warnings(job, index, adjusted, model, placements, cameras)
+    warnings = _warnings(job, index, adjusted, model, placements, cameras, registered)
     given_masks = Path(job.settings["masks"]) if "masks" in job.settings else None
     of_image = {names[row]: cameras[index.camera_ids[row]] for row in registered}
     masks = _masks(given_masks, of_image, warnings)
     for line in warnings:
         sys.stderr.write(f"warning: {line}\n")
     folder = _export_folder(job)
-    keypoints = _all_keypoints(job, index)
+    keypoints = _all_keypoints(job, adjusted.models)
     with temporary_folder(folder) as temporary:
         for number, placement in enumerate(placements):
             selected = _moved(adjusted.select_model(number), placement) if number else model
@@ -135,10 +132,10 @@ def _warnings(
     model: Reconstruction,
     placements: list[Placement],
     cameras: list[Camera],
+    registered: np.ndarray,
 ) -> list[str]:
-    """What a user should know of the model, a sentence each."""
+    """What a user should know of the model with the ``registered`` images (rows), a sentence each."""
     names = [str(name) for name in index.names]
-    registered = np.flatnonzero(has_pose(model.rotations, model.translations))
     used = {row: cameras[row] for row in sorted({int(index.camera_ids[row]) for row in registered})}
     warnings = _camera_warnings(adjusted, used)
     warnings += _lens_warnings(model, cameras, index.camera_ids)
@@ -216,16 +213,22 @@ def _masks(folder: Path | None, cameras: dict[str, Camera], warnings: list[str])
     return masks
 
 
-def _placement(job: StageJob, index: ImageIndex, model: Reconstruction) -> Placement:
-    return find_placement(
-        model.rotations,
-        model.translations,
-        index.orientations,
-        index.gps,
-        [str(name) for name in index.names],
-        job.options.georeference,
-        job.seed_for("georeference"),
-    )
+def _placements(
+    job: StageJob, index: ImageIndex, adjusted: Reconstruction, names: list[str]
+) -> list[Placement]:
+    """Of each model."""
+    return [
+        find_placement(
+            np.where((adjusted.models == number)[:, None, None], adjusted.rotations, np.nan),
+            np.where((adjusted.models == number)[:, None], adjusted.translations, np.nan),
+            index.orientations,
+            index.gps,
+            names,
+            job.options.georeference,
+            job.seed_for("georeference"),
+        )
+        for number in range(max(1, adjusted.model_count))
+    ]
 
 
 def _moved(model: Reconstruction, placement: Placement) -> Reconstruction:
@@ -233,11 +236,12 @@ def _moved(model: Reconstruction, placement: Placement) -> Reconstruction:
     return replace(model, rotations=rotations, translations=translations, points=points)
 
 
-def _all_keypoints(job: StageJob, index: ImageIndex) -> list[np.ndarray] | None:
-    """Per image its keypoints (K_i,2) in original pixels where all are wanted in the model, else None."""
+def _all_keypoints(job: StageJob, models: np.ndarray) -> list[np.ndarray] | None:
+    """Keypoints (K_i,2) in original pixels per image of a model where all are wanted there, else None."""
     if not job.options.all_keypoints:
         return None
-    return gather_image_columns(job.paths("features"), len(index.names), "keypoints")[0]
+    registered = set(np.flatnonzero(models >= 0).tolist())
+    return gather_image_columns(job.paths("features"), len(models), "keypoints", images=registered)[0]
 
 
 def _build(

@@ -61,7 +61,7 @@ def run(job: StageJob) -> None:
     options: ExtractFeaturesOptions = job.options
     index = ImageIndex.read(job.path("index"))
     rows = np.flatnonzero(index.blocks == int(job.settings["block"]))
-    pictures = IndexedImages(index.names, index.sha256, Path(job.settings["images"]))
+    pictures = IndexedImages(index.names, index.sha256, job.settings["images"])
     finder = _create_finder(job, options)
     beside = job.weights_digest() + str(job.settings.get("source_content", ""))
     names = [str(name) for name in index.names[rows]]

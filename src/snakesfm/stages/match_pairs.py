@@ -206,7 +206,7 @@ class ImageFiles:
         from snakesfm.ingest.indexed import IndexedImages
 
         index = ImageIndex.read(job.paths("index")[0])
-        self.images = IndexedImages(index.names, index.sha256, Path(job.settings["images"]))
+        self.images = IndexedImages(index.names, index.sha256, job.settings["images"])
         self._names = [str(name) for name in index.names]
         self.digests = [str(digest) for digest in index.sha256]
         if job.options.method == "virtual_places":

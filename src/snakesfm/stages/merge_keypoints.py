@@ -35,7 +35,7 @@ def run(job: StageJob) -> None:
     index = ImageIndex.read(job.path("index"))
     rows = np.flatnonzero(index.blocks == int(job.settings["block"]))
     found = _gather(job.paths("matches"), set(rows.tolist()))
-    images = IndexedImages(index.names, index.sha256, Path(job.settings["images"]))
+    images = IndexedImages(index.names, index.sha256, job.settings["images"])
     progress = job.progress(len(rows), "images")
     # an empty set in front keeps shapes and dtypes where the block has no image
     keypoints, scores = [np.zeros((0, 2), np.float32)], [np.zeros(0, np.float32)]

@@ -35,13 +35,14 @@ def shared_rays(problem: PositioningProblem) -> tuple[Array, Array, Array]:
     position = np.arange(len(problem.ray_tracks)) - np.repeat(starts, lengths)
     keys = problem.pairs[:, 0] * count + problem.pairs[:, 1]
     order = np.argsort(keys, kind="stable")
+    ordered = keys[order]
     edges, lefts, rights = [], [], []
     for gap in range(1, int(lengths.max(initial=1))):
         left = np.flatnonzero(position + gap < row_length)
         right = left + gap
         key = problem.ray_images[left] * count + problem.ray_images[right]
-        at = np.minimum(np.searchsorted(keys[order], key), max(len(keys) - 1, 0))
-        found = keys[order][at] == key if len(keys) else np.zeros(len(key), dtype=bool)
+        at = np.minimum(np.searchsorted(ordered, key), max(len(keys) - 1, 0))
+        found = ordered[at] == key if len(keys) else np.zeros(len(key), dtype=bool)
         edges.append(order[at[found]] if len(keys) else at[:0])
         lefts.append(left[found])
         rights.append(right[found])

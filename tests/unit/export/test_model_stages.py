@@ -388,7 +388,7 @@ def within_a_metre(gps: np.ndarray) -> None:
         # of nine images one is not registered
         (
             no_altitudes,
-            "5 images of the model have GPS without altitude in EXIF, and fewer than four with it",
+            "5 images of the model have GPS without altitude in EXIF, and fewer than 4 with it",
         ),
         (of_the_lost_image, "no image of the model has GPS in EXIF"),
         (in_another_order, "of 8 positions agree with the model"),
