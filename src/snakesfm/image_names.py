@@ -1,5 +1,6 @@
-"""Matching of image names between two lists."""
+"""Matching of image names between two lists, and their natural order."""
 
+import re
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import PurePosixPath
@@ -29,3 +30,9 @@ def match_names(names: Sequence[str], reference_names: Sequence[str]) -> Array:
             if len(candidates) == 1 and counts[reference_parts[row]] == 1:
                 matched[row] = candidates[0]
     return matched
+
+
+def natural_key(name: str) -> tuple[list[str | int], str]:
+    """Sort key that puts img2 before img10."""
+    parts = re.split(r"(\d+)", name.casefold())
+    return [int(part) if place % 2 else part for place, part in enumerate(parts)], name

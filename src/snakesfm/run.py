@@ -320,10 +320,10 @@ def _describe_accuracy(metrics: dict[str, Any]) -> str:
     images, present = metrics["reference_images"], metrics["reference_images_present"]
     if not present:
         return ", no image name occurs in the reference, so nothing is evaluated"
-    found = [column for column in map(RELATIVE_AUC.fullmatch, metrics) if column]
-    found.sort(key=lambda column: float(column[1]))
-    areas = "/".join(f"{metrics[column[0]]:.1f}" for column in found)
-    thresholds = "/".join(column[1] for column in found)
+    found = [area for area in map(RELATIVE_AUC.fullmatch, metrics) if area]
+    found.sort(key=lambda area: float(area[1]))
+    areas = "/".join(f"{metrics[area[0]]:.1f}" for area in found)
+    thresholds = "/".join(area[1] for area in found)
     share = f" over the reference's {images} images, {present} of them here" if present < images else ""
     return f", relative-pose AUC {areas} at {thresholds} deg{share}"
 

@@ -64,25 +64,22 @@ class _Templates:
     Parameters
     ----------
     rows : (K,) of the observations, ascending.
-    present : (K,) bool, whether their images have pixels.
     patches : (K,S,S) float32 gray values around them.
     inverses : (K,6,6) float64, see :func:`_inverse_normals`.
     to_plane : (K,2,2), coordinates on the point's plane from pixels of the gray image.
     """
 
     rows: Array
-    present: Array
     patches: Array
     inverses: Array
     to_plane: Array
 
     @classmethod
     def at(cls, rows: Array, radius: int) -> "_Templates":
-        """None of them is present yet."""
+        """Of none of them the patch is cut yet."""
         count, side = len(rows), 2 * radius + 3
         return cls(
             rows,
-            np.zeros(count, dtype=bool),
             np.zeros((count, side, side), dtype=np.float32),
             np.zeros((count, 6, 6)),
             np.zeros((count, 2, 2)),
@@ -157,8 +154,7 @@ def align_observations(
     with ThreadPoolExecutor(settings.threads) as pool:
         for batch in sorted(to_cut.keys() | to_align.keys()):
             own = to_cut.get(batch, NOTHING)
-            _cut_templates(pool, read_gray, images, pixels, tangents, cut, own)
-            aligned[cut.rows[own]] = cut.present[own]
+            _cut_templates(pool, read_gray, images, pixels, tangents, cut, own, aligned)
             rows = usable[to_align.get(batch, NOTHING)]
             rows = rows[aligned[templates[rows]]]
             parts = [(image, rows[mine]) for image, mine in rows_of_each(images[rows])]
@@ -175,8 +171,9 @@ def _cut_templates(
     tangents: Array,
     templates: _Templates,
     which: Array,
+    there: Array,
 ) -> None:
-    """Fill in some (k,) of the templates, with a border of a pixel for gradients."""
+    """Fill in some (k,) of the templates, with a border of a pixel for gradients; ``there`` marks them."""
     x, y = _grid(templates.patches.shape[1] // 2)
 
     def cut(part: tuple[int, Array]) -> None:
@@ -189,7 +186,7 @@ def _cut_templates(
         patches = _sample(read.gray.astype(np.float32), place[:, :1] + x, place[:, 1:] + y)
         templates.patches[mine] = patches.reshape(-1, *templates.patches.shape[1:])
         templates.to_plane[mine] = _inverse(tangents[rows] / read.scale[:, None])
-        templates.present[mine] = True
+        there[rows] = True
 
     def invert(part: Array) -> None:
         templates.inverses[part] = _inverse_normals(templates.patches[part])

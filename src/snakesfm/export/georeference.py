@@ -12,7 +12,7 @@ from snakesfm.geometry.colmap_binding import pycolmap
 from snakesfm.geometry.earth import Origin, local_metres
 from snakesfm.geometry.poses import Similarity
 from snakesfm.geometry.robust import robust_sigma
-from snakesfm.retrieval.pairs import natural_key
+from snakesfm.image_names import natural_key
 
 # the first is what satellite navigation without corrections errs by at worst, height included; within the
 # others, a majority of good positions is told from others that err alike, as of a receiver that froze

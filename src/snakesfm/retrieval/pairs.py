@@ -1,6 +1,5 @@
 """The choice of image pairs: all, neighbours in order, similar ones, or listed by the user."""
 
-import re
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -8,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from snakesfm.arrays import Array
+from snakesfm.image_names import natural_key
 
 HELD_BYTES = 1 << 29
 
@@ -63,12 +63,6 @@ class PairTable:
             for code in range(1 << len(REASONS))
         ]
         return [texts[code] for code in self.reasons]
-
-
-def natural_key(name: str) -> tuple[list[str | int], str]:
-    """Sort key that puts img2 before img10."""
-    parts = re.split(r"(\d+)", name.casefold())
-    return [int(part) if place % 2 else part for place, part in enumerate(parts)], name
 
 
 def exhaustive_pairs(count: int) -> PairTable:

@@ -36,20 +36,20 @@ def shared_rays(problem: PositioningProblem) -> tuple[Array, Array, Array]:
     keys = problem.pairs[:, 0] * count + problem.pairs[:, 1]
     order = np.argsort(keys, kind="stable")
     ordered = keys[order]
-    edges, lefts, rights = [], [], []
-    for gap in range(1, int(lengths.max(initial=1))):
+    empty = np.zeros(0, dtype=np.int64)
+    edges, lefts, rights = [empty], [empty], [empty]
+    for gap in range(1, int(lengths.max(initial=1)) if len(keys) else 1):
         left = np.flatnonzero(position + gap < row_length)
         right = left + gap
         key = problem.ray_images[left] * count + problem.ray_images[right]
-        at = np.minimum(np.searchsorted(ordered, key), max(len(keys) - 1, 0))
-        found = ordered[at] == key if len(keys) else np.zeros(len(key), dtype=bool)
-        edges.append(order[at[found]] if len(keys) else at[:0])
+        at = np.minimum(np.searchsorted(ordered, key), len(keys) - 1)
+        found = ordered[at] == key
+        edges.append(order[at[found]])
         lefts.append(left[found])
         rights.append(right[found])
-    empty = np.zeros(0, dtype=np.int64)
-    shared = tuple(np.concatenate([empty, *parts]) for parts in (edges, lefts, rights))
-    kept = _thinned(shared[0], len(keys))
-    return shared[0][kept], shared[1][kept], shared[2][kept]
+    edge, left, right = (np.concatenate(parts) for parts in (edges, lefts, rights))
+    kept = _thinned(edge, len(keys))
+    return edge[kept], left[kept], right[kept]
 
 
 def _thinned(edges: Array, count: int) -> Array | slice:

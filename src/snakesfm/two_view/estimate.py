@@ -192,7 +192,6 @@ def _judge(
     elif significance < options.min_significance or len(rows) * ratio < options.min_support:
         rejection = "not_significant"
     else:
-        by_chance = expected_by_chance(refined.errors_px, float(extent[0]), float(extent[1]), selection_px)
         alone = None
         if angle_deg < options.rotation_only_angle_deg:
             alone = _rotation_alone(points, matches, rows, refined, selection_px, options)
@@ -202,7 +201,8 @@ def _judge(
             covariance = np.eye(5) * DIRECTION_UNKNOWN_VARIANCE
             covariance[:3, :3] = of_rotation
         else:
-            kind, ambiguous = _kind_of(inliers, by_chance, refined, selection_px, options, seed)
+            own_px = refined.errors_px[rows]
+            kind, ambiguous = _kind_of(inliers, own_px, extent, refined, selection_px, options, seed)
         worst = float(np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1]))
         if worst > np.radians(options.max_rotation_std_deg):
             rejection = "indeterminate"
@@ -277,7 +277,8 @@ def _rotation_alone(
 
 def _kind_of(
     inliers: Correspondences,
-    by_chance: float,
+    own_px: Array,
+    extent: Array,
     refined: RefinedPose,
     selection_px: float,
     options: "EstimateTwoViewOptions",
@@ -288,19 +289,22 @@ def _kind_of(
     kind = "planar" if explained >= options.planar_ratio * len(inliers) else "general"
     if options.min_ambiguity_gap == 0 or explained < TWIN_PLANE_RATIO * len(inliers):
         return kind, False
-    gaps = [_gap_to(inliers, by_chance, refined, twin, selection_px) for twin in planar_twins(H)]
+    by_chance = expected_by_chance(refined.errors_px, float(extent[0]), float(extent[1]), selection_px)
+    gaps = [_gap_to(inliers, own_px, by_chance, refined, twin, selection_px) for twin in planar_twins(H)]
     return kind, min(gaps, default=np.inf) < options.min_ambiguity_gap
 
 
 def _gap_to(
     inliers: Correspondences,
+    own_px: Array,
     by_chance: float,
     refined: RefinedPose,
     twin: tuple[Array, Array],
     selection_px: float,
 ) -> float:
-    """Log-likelihood of the inliers lost by another pose; infinite if it is no rival.
+    """Log-likelihood of the inliers lost by another pose than theirs, whose errors are ``own_px``.
 
+    Infinite if the other is no rival.
     As many inliers as are expected ``by_chance``, rounded up, are left out, those farthest from the rival:
     a mismatch that happens to lie on the own pose's epipolar line may be far from the rival's, and alone
     would decide.
@@ -318,5 +322,4 @@ def _gap_to(
         return float("inf")
     others = sampson_errors_px(inliers, *rival)
     told = np.argsort(np.abs(others), kind="stable")[: max(len(inliers) - ceil(by_chance), 0)]
-    own = sampson_errors_px(inliers.take(told), refined.rotation, refined.translation)
-    return 2.0 * (cauchy_cost(others[told], scale) - cauchy_cost(own, scale))
+    return 2.0 * (cauchy_cost(others[told], scale) - cauchy_cost(own_px[told], scale))

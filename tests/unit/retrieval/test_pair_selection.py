@@ -5,8 +5,9 @@ import pytest
 
 from snakesfm.config.select_pairs import SelectPairsOptions
 from snakesfm.errors import ConfigError
+from snakesfm.image_names import natural_key
 from snakesfm.retrieval.listed import listed_pairs
-from snakesfm.retrieval.pairs import PairTable, natural_key, sequential_pairs, similar_pairs
+from snakesfm.retrieval.pairs import PairTable, sequential_pairs, similar_pairs
 from snakesfm.retrieval.rounding import round_units
 
 
