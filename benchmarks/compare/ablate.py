@@ -122,9 +122,9 @@ def render_ablations(
         "# Ablations",
         "",
         f"Generated on {date} by `python -m benchmarks.compare ablate`; do not edit. Relative-pose AUC at 1 degree "
-        "in per cent with one option changed; change: mean over the sets against the default. * marks surveyed truth.",
+        "in per cent with one option changed; change: mean over the sets against the default. * marks independent references.",
         "",
-        *markdown_head(["option", "change", "change on surveyed truth", *titles]),
+        *markdown_head(["option", "change", "change on independent references", *titles]),
     ]
     for name in names:
         cells = [

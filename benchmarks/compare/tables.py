@@ -115,9 +115,9 @@ def render_page(results: Sequence[Result], machine: Mapping[str, str], command: 
     for name, result in sets.items():
         given = "given and held fixed" if result.known else "unknown"
         kind = (
-            "surveyed truth"
+            "independent"
             if result.truth
-            else "a reconstruction, which favours the software that made it"
+            else "COLMAP's reconstruction of these images, which favours the software that made it"
         )
         lines += ["", f"## {name}", ""]
         lines.append(f"{result.images} images; intrinsics {given}; the reference is {kind}.")
@@ -155,8 +155,10 @@ def _summary(sets: Mapping[str, Result], groups: Mapping[Key, list[Result]]) -> 
         "",
         "## Summary",
         "",
-        "Differences to the better of COLMAP's two mappers; * marks surveyed truth. The references of the other sets "
-        "were made by COLMAP's incremental mapper: there its rows show how well it repeats itself.",
+        "Differences to the better of COLMAP's two mappers; * marks independent references, which are no "
+        "COLMAP model of these images (laser scans, calibrated motion, GPS/INS; Lund: another system's reconstruction; "
+        "Reichstag: COLMAP's of the whole collection). The other references were made by COLMAP's incremental mapper "
+        "from the same images: there its rows show how well it repeats itself.",
         "",
     ]
     measures = ("@3", "@5", "registered")
@@ -190,7 +192,7 @@ def _tallies(sets: Mapping[str, Result], groups: Mapping[Key, list[Result]]) -> 
     for setting in SETTINGS:
         for label, chosen in (
             ("all sets", sets),
-            ("surveyed truth", {n: r for n, r in sets.items() if r.truth}),
+            ("independent references", {n: r for n, r in sets.items() if r.truth}),
         ):
             counts = []
             for key, title in zip(AREAS, ("@1", "@3", "@5"), strict=True):

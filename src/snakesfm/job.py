@@ -209,6 +209,9 @@ def _fail(call: Call, error: Exception, terminal: Any) -> None:
     elif isinstance(error, MemoryError):
         sentence = "Not enough memory: give the job more mem_mb, or use more blocks."
         _print_trace()
+    elif type(error).__name__ == "OutOfMemoryError":
+        sentence = "Not enough memory on the CUDA device: set batch_size=1, smaller images, or device=cpu."
+        _print_trace()
     else:
         _print_trace()
         sentence = f"Unexpected {type(error).__name__}: {error}; see {call.log} for details."

@@ -110,7 +110,9 @@ def job_load(
     if grain == "block":
         side = min(shorter_side_px, LARGEST_SIDE_PX)
         area = (side / MEASURED_SIDE_PX) ** 2 if NEEDS[stage].area_mb else 1.0
-        return Load(images / blocks, 0, networks, batch, area)
+        # the pairs of a block's images are those of its tiles
+        of_block = pairs * (2 * blocks - 1) / blocks**2 if NEEDS[stage].pair_mb else 0
+        return Load(images / blocks, of_block, networks, batch, area)
     if grain == "tile":
         tiles = blocks * (blocks + 1) / 2
         return Load(min(2 / blocks, 1) * images, pairs / tiles, networks, batch)

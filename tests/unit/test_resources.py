@@ -31,6 +31,10 @@ def test_needs_grow_with_the_scene(stage: str) -> None:
 def test_pairs_are_dealt_to_the_tiles() -> None:
     assert job_load("match_pairs", 1000, 8, 3600) == Load(250, 100)
     assert job_load("match_pairs", 1000, 1, 3600) == Load(1000, 3600)
+    # a block of four is in seven of sixteen halves of tiles
+    assert job_load("merge_keypoints", 1000, 4, 3200) == Load(250, 1400)
+    assert job_load("merge_keypoints", 1000, 1, 3600) == Load(1000, 3600)
+    assert job_load("extract_features", 1000, 4, 3200) == Load(250, 0)
 
 
 @pytest.mark.parametrize("stage", STAGES)

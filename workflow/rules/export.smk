@@ -79,7 +79,11 @@ rule evaluate_model:
         reconstruction=artifact("adjust_bundle", "reconstruction.h5"),
     output:
         artifact("evaluate_model", "metrics.json"),
-        artifact("evaluate_model", "metrics.csv"),
+        report(
+            artifact("evaluate_model", "metrics.csv"),
+            category="{scene}",
+            labels={"file": "metrics"},
+        ),
     log:
         log_file("evaluate_model"),
     resources:

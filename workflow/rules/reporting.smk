@@ -14,7 +14,11 @@ rule render_report:
         metrics=artifact("evaluate_model", "metrics.json"),
         summary=artifact("export_model", "summary.json"),
     output:
-        artifact("render_report", "index.html"),
+        report(
+            artifact("render_report", "index.html"),
+            category="{scene}",
+            labels={"file": "what each stage kept and refused"},
+        ),
     log:
         log_file("render_report"),
     resources:

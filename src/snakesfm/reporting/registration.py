@@ -9,7 +9,18 @@ from snakesfm.arrays import Array
 
 @dataclass(frozen=True)
 class ImageCounts:
-    """What each stage kept of every image, columns of length N."""
+    """What each stage kept of every image.
+
+    Parameters
+    ----------
+    pairs, accepted, kept : (N,) int64, image pairs that were matched, were accepted, and are edges after averaging.
+    components : (N,) int32, component of the filtered view graph, 0 the largest.
+    rotated : (N,) bool, whether averaging gave it a rotation.
+    track_observations, point_observations, observations : (N,) int64, its keypoints in tracks, in triangulated points
+        and in the first model.
+    models : (N,) int32, the model it is in, -1 none.
+    mean_error_px : (N,) float64, mean reprojection error in the first model, NaN without observations.
+    """
 
     pairs: Array
     accepted: Array
@@ -24,7 +35,7 @@ class ImageCounts:
 
     @property
     def registered(self) -> Array:
-        """Which images are in the first model."""
+        """Which images are in the first model, (N,) bool."""
         return np.asarray(self.models == 0)
 
 
@@ -59,6 +70,9 @@ def reason_not_registered(
     """
     if counts.registered[image]:
         return ""
+    if counts.models[image] > 0:
+        size = int(np.sum(counts.models == counts.models[image]))
+        return f"It is in a separate model of {size} images, in sparse/{counts.models[image]}."
     if duplicate_of:
         return f"It is an exact copy of {duplicate_of}, which is used instead."
     if counts.pairs[image] == 0:
@@ -67,9 +81,6 @@ def reason_not_registered(
         return f"None of its {counts.pairs[image]} pairs was accepted: {_listed(rejections)}."
     if counts.kept[image] == 0:
         return f"All its {counts.accepted[image]} view-graph edges were refused: {_listed(edge_labels)}."
-    if counts.models[image] > 0:
-        size = int(np.sum(counts.models == counts.models[image]))
-        return f"It is in a separate model of {size} images, in sparse/{counts.models[image]}."
     if counts.components[image] != 0:
         size = int(np.sum(counts.components == counts.components[image]))
         return f"It is in a component of {size} images that is not connected to the largest one."

@@ -155,7 +155,8 @@ def _warnings(
     warnings += [str(line) for line in index.warnings]
     warnings += [str(line) for line in CalibratedCameras.read(job.path("cameras")).warnings]
     warnings += placement_warnings(placements, names, job.options.georeference is True)
-    copies = int(np.count_nonzero(index.duplicate_of >= 0))
+    # a list of pairs may name copies, which then are images as any other
+    copies = int(np.count_nonzero((index.duplicate_of >= 0) & (adjusted.models < 0)))
     return warnings + ([COPIES.format(count=copies)] if copies else [])
 
 

@@ -103,10 +103,10 @@ def run(job: StageJob) -> None:
         stages=_stage_rows(
             index, calibrated, pairs, graph, rotations, tracks, points, model, counts, seconds
         ),
-        tables=_tables(pairs, graph, model, summary, metrics),
+        tables=_tables(pairs, rotations.labels, model, summary, metrics),
         histogram=error_histogram(errors),
         histogram_caption=f"Errors of {len(errors):,} observations; the last bar includes the largest 1 %.",
-        missing=_missing(index, names, counts, pairs, graph),
+        missing=_missing(index, names, counts, pairs, graph.pairs, rotations.labels),
         refused=[[str(a), str(b)] for a, b in zip(index.refused_names, index.refused_reasons, strict=True)],
         image_heads=heads,
         images=rows,
@@ -132,7 +132,7 @@ def _counts(
     return ImageCounts(
         pairs=count_by_image(pairs.pairs, count),
         accepted=count_by_image(pairs.pairs[pairs.rejections == 0], count),
-        kept=count_by_image(graph.pairs[graph.labels == 0], count),
+        kept=count_by_image(graph.pairs[rotations.labels == 0], count),
         components=graph.components,
         rotated=np.asarray(np.isfinite(rotations.rotations).all(axis=(1, 2))),
         track_observations=count_by_image(tracks["image_ids"], count),
@@ -145,7 +145,7 @@ def _counts(
 
 def _tables(
     pairs: Pairs,
-    graph: ViewGraph,
+    edge_labels: Array,
     model: Reconstruction,
     summary: Mapping[str, Any],
     metrics: Mapping[str, Any],
@@ -155,7 +155,7 @@ def _tables(
     rounds = bundle_rows(model.round_names, model.round_counts, model.round_costs, model.round_errors_px)
     return [
         ("Pairs", ["outcome", "pairs"], outcomes),
-        ("View graph", ["filter", "edges"], label_counts(graph.labels, EDGE_LABELS)),
+        ("View graph", ["filter", "edges"], label_counts(edge_labels, EDGE_LABELS)),
         ("Bundle adjustment", ROUND_HEADS, rounds),
         ("Georeference", PLACE_HEADS, place_rows(summary)),
         *metric_tables(metrics),
@@ -219,7 +219,7 @@ def _stage_rows(
     kinds = Counter(pairs.kinds[accepted].tolist())
     kind_text = ", ".join(f"{kinds[k]:,} {KINDS[k].replace('_', ' ')}" for k in sorted(kinds))
     sizes = np.bincount(graph.components[graph.components >= 0])
-    residuals = rotations.residuals_deg[np.isfinite(rotations.residuals_deg)]
+    residuals = rotations.residuals_deg[(rotations.labels == 0) & np.isfinite(rotations.residuals_deg)]
     residual = f", median residual {np.median(residuals):.2f} deg" if len(residuals) else ""
     duplicates = int(np.sum(index.duplicate_of >= 0))
     results = {
@@ -257,15 +257,20 @@ def _describe_focals(cameras: CalibratedCameras) -> str:
 
 
 def _missing(
-    index: ImageIndex, names: Sequence[str], counts: ImageCounts, pairs: Pairs, graph: ViewGraph
+    index: ImageIndex,
+    names: Sequence[str],
+    counts: ImageCounts,
+    pairs: Pairs,
+    edges: Array,
+    edge_labels: Array,
 ) -> list[list[str]]:
     rows = []
-    rejections, labels = (dict(rows_of_each(np.ravel(found.pairs))) for found in (pairs, graph))
+    rejections, labels = (dict(rows_of_each(np.ravel(found))) for found in (pairs.pairs, edges))
     nothing = np.zeros(0, np.int64)
     for image in np.flatnonzero(~counts.registered).tolist():
         # a pair stands at two places of the flat list
         refused = pairs.rejections[rejections.get(image, nothing) // 2]
-        dropped = graph.labels[labels.get(image, nothing) // 2]
+        dropped = edge_labels[labels.get(image, nothing) // 2]
         first = int(index.duplicate_of[image])
         reason = reason_not_registered(
             image,

@@ -123,7 +123,7 @@ def test_page_and_csv_hold_what_was_measured(results: list[Result]) -> None:
     # wall and processor time against incremental, GLOMAP and openMVG; then mapping
     assert speeds[2:] == ["8.0x", "2.5x", "", "8.0x", "2.5x", "", "0.5x", "", "0.5x", ""]
     assert (
-        "(a) own front-end, surveyed truth: better / equal (within 0.1) / worse in AUC: @1 1 / 0 / 0"
+        "(a) own front-end, independent references: better / equal (within 0.1) / worse in AUC: @1 1 / 0 / 0"
         in page
     )
     assert "| snakesfm | 30 | 91.00 (90.00..92.00) |" in page

@@ -41,7 +41,7 @@ def row_of(start: str) -> list[str]:
 
 
 @pytest.mark.parametrize("name", list(SETS)[:9])
-def test_accuracy_and_time_with_surveyed_truth(name):
+def test_accuracy_and_time_with_independent_references(name):
     _, images, *figures = row_of(name)
     measured = medians("benchmarks", SETS[name])
     assert measured.images[OURS] == int(images)

@@ -55,6 +55,10 @@ def counts(**changes: object) -> ImageCounts:
             "None of its 5 pairs was accepted: low inlier ratio (2), too few inliers (3).",
         ),
         ({"kept": [0, 3, 3]}, "All its 4 view-graph edges were refused: cycle min (4)."),
+        (
+            {"models": [1, 0, 1], "accepted": [0, 4, 4], "kept": [0, 3, 3]},
+            "a separate model of 2 images, in sparse/1",
+        ),
         ({"components": [2, 0, 0]}, "component of 1 images"),
         ({"rotated": [False, True, True]}, "no rotation"),
         ({"track_observations": [0, 9, 9]}, "in no track"),
