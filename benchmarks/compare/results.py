@@ -30,7 +30,7 @@ class Result:
     Attributes
     ----------
     image_set, images, known, truth : name, number of images, whether intrinsics were given, and whether the
-        reference is another than a COLMAP model of these images.
+        reference is no COLMAP model of these images.
     method, setting, seed : which of METHODS, with its own front-end or on the same features as snakesfm.
     failure : why there is no model; empty where there is one.
     metrics : the project's own evaluation of the model.

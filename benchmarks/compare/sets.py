@@ -17,7 +17,7 @@ IMAGE_SUFFIXES = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp"}
 
 @dataclass(frozen=True)
 class ImageSet:
-    """One set; are its intrinsics given to everyone, and is its reference another than COLMAP's of these images?"""
+    """One set; are its intrinsics given to all, and is its reference no COLMAP model of these images?"""
 
     folder: Path
     known: bool

@@ -49,7 +49,7 @@ def use_device(wanted: str) -> None:
 
 
 def take_turn(device: str) -> None:
-    """Wait until no other job of this user on this machine holds the device, then hold it until this process ends.
+    """Wait until no other job of this user on this machine holds the device, then hold it to the end.
 
     Two jobs together often do not fit into its memory, and they are no faster than one after the other.
     ``device`` is what identifies it among all of the machine, whichever of them the process may see.

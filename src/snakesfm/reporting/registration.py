@@ -13,11 +13,11 @@ class ImageCounts:
 
     Parameters
     ----------
-    pairs, accepted, kept : (N,) int64, image pairs that were matched, were accepted, and are edges after averaging.
+    pairs, accepted, kept : (N,) int64, its pairs that were matched, accepted, kept by averaging.
     components : (N,) int32, component of the filtered view graph, 0 the largest.
     rotated : (N,) bool, whether averaging gave it a rotation.
-    track_observations, point_observations, observations : (N,) int64, its keypoints in tracks, in triangulated points
-        and in the first model.
+    track_observations, point_observations, observations : (N,) int64, its keypoints in tracks, in
+        triangulated points, and in the first model.
     models : (N,) int32, the model it is in, -1 none.
     mean_error_px : (N,) float64, mean reprojection error in the first model, NaN without observations.
     """
