@@ -108,29 +108,37 @@ def _options(m: Measurement) -> str:
 
 
 def _stages(rows: Sequence[Measurement]) -> str:
-    stages = [stage for stage in NEEDS if any(stage in m.stages for m in rows)]
-    columns = [m for m in rows if m.stages]
-    lines = []
-    for stage in stages:
-        cells = []
-        for m in columns:
-            need = m.stages.get(stage)
-            mark = "" if m.comparable(stage) else " *"
-            cells.append(f"{need.cpu:.1f} s, {need.most_mb:.0f} MB{mark}" if need else "")
-        points = [(m.images, m.stages[stage].cpu) for m in columns if m.comparable(stage)]
-        if stage in TILED:
-            needs = [m.stages[stage] for m in columns if stage in m.stages]
-            per = f"{' / '.join(f'{1000 * n.cpu / n.pairs:.1f}' for n in needs if n.pairs)} ms per pair"
-            points = []
-        else:
-            costs = [f"{1000 * cpu / images:.1f}" for images, cpu in points]
-            per = f"{' / '.join(costs)} ms per image"
-        slope = exponent(points)
-        lines.append([f"`{stage}`", *cells, per, f"{slope:.2f}" if slope is not None else "-"])
-    table = _table(["stage", *[f"{m.images:,}" for m in columns], "cost", "p"], lines)
-    if any(m.config for m in columns):
-        table += "\n\n\\* not by default (above), so neither in the cost nor in p."
-    return table
+    """A table per start of the workflow; the exponents are of the runs of all tables."""
+    parts = []
+    for first in sorted({m.first for m in rows if m.stages}, key=list(NEEDS).index):
+        columns = [m for m in rows if m.stages and m.first == first]
+        lines = [_stage(stage, columns, rows) for stage in NEEDS if any(stage in m.stages for m in columns)]
+        sums = [
+            f"{sum(need.cpu for need in m.stages.values()):.1f} s{' *' * bool(m.config)}" for m in columns
+        ]
+        head = ["stage", *[f"{m.images:,}" for m in columns], "cost of the largest run", "p"]
+        parts += [f"Runs from the artifacts of `{first}`:", _table(head, [*lines, ["sum", *sums, "", ""]])]
+    if any(m.config for m in rows):
+        parts.append("\\* not by default (above), so neither in the cost nor in p.")
+    return "\n\n".join(parts)
+
+
+def _stage(stage: str, columns: Sequence[Measurement], rows: Sequence[Measurement]) -> list[str]:
+    """The row of a stage: what it took in some runs, its cost in the largest, and its exponent in all."""
+    cells = []
+    for m in columns:
+        need = m.stages.get(stage)
+        mark = "" if m.comparable(stage) else " *"
+        cells.append(f"{need.cpu:.1f} s, {need.most_mb:.0f} MB{mark}" if need else "")
+    largest = max((m for m in columns if m.comparable(stage)), key=lambda m: m.images, default=None)
+    cost = ""
+    if largest is not None:
+        need = largest.stages[stage]
+        of, count = ("pair", need.pairs) if stage in TILED else ("image", largest.images)
+        cost = f"{1000 * need.cpu / count:.1f} ms per {of}" if count else ""
+    points = [(m.images, m.stages[stage].cpu) for m in rows if m.comparable(stage) and stage not in TILED]
+    slope = exponent(points)
+    return [f"`{stage}`", *cells, cost, f"{slope:.2f}" if slope is not None else "-"]
 
 
 def _needs(measurements: Sequence[Measurement]) -> str:

@@ -27,6 +27,66 @@ from snakesfm.config.configuration import (
 )
 
 WIDTH = 110
+FILES = {
+    "image_index": ("index_images/index.h5",),
+    "local_features": ("extract_features/BLOCK.h5", "merge_keypoints/BLOCK.h5"),
+    "vocabulary": ("learn_vocabulary/vocabulary.h5",),
+    "global_descriptors": ("describe_images/BLOCK.h5",),
+    "image_pairs": ("select_pairs/TILE.h5",),
+    "pair_matches": ("match_pairs/TILE.h5", "index_matches/TILE.h5"),
+    "pair_coordinates": ("match_pairs/TILE.h5",),
+    "calibrated_cameras": ("calibrate_cameras/cameras.h5",),
+    "two_view_geometries": ("estimate_two_view/TILE.h5",),
+    "view_graph": ("build_view_graph/graph.h5", "filter_view_graph/graph.h5"),
+    "camera_rotations": ("average_rotations/rotations.h5",),
+    "tracks": ("build_tracks/tracks.h5",),
+    "camera_centers": ("average_translations/centers.h5",),
+    "triangulated_points": ("triangulate_tracks/points.h5",),
+    "reconstruction": ("adjust_bundle/reconstruction.h5",),
+}
+"""Where the artifacts of a kind are, below OUTPUT/SCENE."""
+JSON_FILES = """
+## metrics.json and metrics.csv
+
+`evaluate_model/metrics.json` is of the largest model; `metrics.csv` has its scalars as one row. Values that do not exist are
+null, in the CSV file empty.
+
+| key | meaning |
+|---|---|
+| `scene`, `images`, `registered_images`, `images_in_other_models` | name, images of the index, of the largest model, of all other models |
+| `points`, `observations`, `observations_per_image` | number of points, of their observations, and of the latter per registered image |
+| `track_length_mean`, `_median` | observations per point |
+| `reprojection_error_px_mean`, `_median` | original pixels; the mean is over observations, the median over the points' means |
+
+With a reference model there are also:
+
+| key | meaning |
+|---|---|
+| `reference_images`, `reference_images_present`, `reference_images_registered` | images with a pose in the reference; how many of them this scene has; how many have a pose in the model. All following values are of the first |
+| `relative_pose_auc_Tdeg` | area under the recall curve up to T degrees, in per cent, of the larger of the errors in rotation and in direction of translation, over all ordered pairs of images (a sample beyond 2,000 images); a pair with an image without a pose counts as 180 degrees |
+| `relative_pairs` | number of these pairs |
+| `relative_rotation_error_deg_S`, `relative_translation_angle_deg_S` | these errors over pairs of registered images; S is median, mean, p90 or max |
+| `pose_auc_Tdeg` | the same area for the larger of the errors in rotation and in the angle between the position vectors from the origin, over all images after alignment by a similarity transform; an image without a pose counts as 180 degrees |
+| `rotation_error_deg_S`, `translation_angle_deg_S`, `position_error_S` | these errors, and distances in units of the reference, of registered images after alignment |
+| `position_error_percent_S` | the distances in per cent of `reference_extent` |
+| `reference_extent`, `alignment_scale` | diagonal of the box around the reference's camera centres; scale of the alignment |
+| `reference`, `per_image` | only in the JSON file: path of the reference, and per image `rotation_error_deg`, `translation_angle_deg`, `position_error` |
+
+## summary.json
+
+`export_model/summary.json`:
+
+| key | meaning |
+|---|---|
+| `scene`, `images`, `registered_images` | name, images of the index, images of the largest model |
+| `images_in_other_models` | list: number of images of `sparse/1`, `sparse/2`, ... |
+| `not_registered` | names of the images that are in no model |
+| `points`, `observations`, `mean_track_length`, `mean_reprojection_error_px` | of the largest model, in original pixels |
+| `warnings` | list of sentences |
+| `georeference` | null, or the place of the largest model: `axes`, `origin_latitude_longitude_altitude` (degrees and metres, WGS84), `images_with_position`, `inliers` (positions that agree with the model), `median_residual_m`, `median_horizontal_residual_m`, `median_vertical_residual_m`, `altitude_steps` |
+| `georeference_refused` | why the largest model has no place, if images have GPS or `georeference` is true; else null |
+| `georeference_of_models` | list: the same as `georeference` for each model |
+"""
 
 
 @functools.cache
@@ -114,13 +174,19 @@ def render_configuration_page() -> str:
         "Generated from the options models by `python -m snakesfm.documentation`; do not edit.",
         "",
         "Options are read from `config.yaml`, then from files given with `--configfile`, then from "
-        "`--config KEY=VALUE`; stage options nest: `--config 'extract_features={max_keypoints: 8000}'`. "
+        "`--config KEY=VALUE`; give all of them behind one `--config` (a second one is refused), and all files "
+        "behind one `--configfile`. Stage options nest: `--config 'extract_features={max_keypoints: 8000}'`. "
         "Unknown keys are refused. Threads, memory and partitions are not options; they are set in the profile.",
         "",
         "In the stages after matching, options in pixels (`_px`) refer to the images as the detector sees them, "
         "scaled down to `extract_features.max_shorter_side_px` (LoFTR: `match_pairs.longer_side_px`), so they need "
         "not be changed for larger photographs. Imported keypoints are assumed to come from images of that size: "
         "if it was another, set the option to it. Files hold original pixels.",
+        "",
+        "**Which options matter.** Most users need only `images`, `output`, `masks` and `cameras`; "
+        "`extract_features.max_shorter_side_px` and `max_keypoints` (more points); `select_pairs.method` (order of "
+        "names, GPS, own list); `index_images.camera_sharing` and `camera_model` (lens); "
+        "`export_model.undistort` and `georeference`. The others are mostly for experiments.",
         "",
         "## The run",
         "",
@@ -178,7 +244,7 @@ def render_artifacts_page() -> str:
         "",
         "Generated from `src/snakesfm/artifacts` by `python -m snakesfm.documentation`; do not edit.",
         "",
-        "Every stage writes HDF5 files at `OUTPUT/SCENE/STAGE/FILE.h5`, one per job; a file is complete or absent. "
+        "Every stage up to `adjust_bundle` writes HDF5 files at `OUTPUT/SCENE/STAGE/FILE.h5`, one per job (`select_pairs`: one per tile in one job); a file is complete or absent. BLOCK is 0, 1, ...; TILE is 0-0, 0-1, ... "
         "The root attributes are `artifact` (the kind below), `format_version`, `stage`, `stage_version`, `scene`, "
         "`options`, `settings` (canonical JSON; `settings` holds the seed and other inputs that are not options), "
         "`software`, and `checksum` (CRC-32 of all datasets in the order of the table below; readers refuse a file "
@@ -197,6 +263,8 @@ def render_artifacts_page() -> str:
             "",
             _sentence(cls),
             "",
+            f"Files: {', '.join(f'`{file}`' for file in FILES[cls.kind])}.",
+            "",
             "| dataset | shape | dtype | meaning |",
             "|---|---|---|---|",
         ]
@@ -204,7 +272,7 @@ def render_artifacts_page() -> str:
             meta = field.metadata
             dtype = "UTF-8 string" if meta["dtype"] == "str" else meta["dtype"].replace("|", " or ")
             lines.append(f"| `{field.name}` | {meta['shape']} | {dtype} | {meta['description']} |")
-    return "\n".join(lines) + "\n"
+    return "\n".join(lines) + "\n" + JSON_FILES
 
 
 GENERATED = {

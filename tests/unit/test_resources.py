@@ -4,7 +4,9 @@ from pathlib import Path
 
 import pytest
 
+from snakesfm.blocks import choose_blocks
 from snakesfm.config.configuration import STAGES
+from snakesfm.config.select_pairs import SelectPairsOptions
 from snakesfm.resources import NEEDS, START_MIN, Load, job_load, memory_mb, runtime_min
 
 
@@ -50,6 +52,43 @@ def test_the_page_on_clusters_names_the_needs(root: Path, stage: str) -> None:
     numbers = (need.constant_mb, need.image_mb, need.pair_mb, need.image_s, need.pair_s)
     row = f"| `{stage}` | {need.grain} | " + " | ".join(f"{number:g}" for number in numbers) + " |"
     assert row in (root / "docs" / "cluster.md").read_text()
+
+
+@pytest.mark.parametrize("images", [250, 1000, 2000, 5000])
+def test_the_guide_says_what_groups_of_jobs_ask_for(root: Path, images: int) -> None:
+    options = SelectPairsOptions().resolve(images)
+    proposed = options.count_proposed(images)
+    chosen, blocks = options.count_chosen(images, proposed), choose_blocks(images)
+    loads = {
+        stage: job_load(stage, images, blocks, proposed if stage == "select_pairs" else chosen)
+        for stage in STAGES
+    }
+    mb, minutes = (
+        {stage: ask(stage, loads[stage]) for stage in STAGES} for ask in (memory_mb, runtime_min)
+    )
+    first, last = STAGES.index("build_view_graph"), STAGES.index("adjust_bundle")
+    mapping, unused = STAGES[first : last + 1], {"merge_keypoints", "index_matches"}
+    # Snakemake adds what jobs that can run side by side ask for, and the times of those that follow
+    mapping_min = sum(minutes[stage] for stage in mapping)
+    finish_mb = max(mb["export_model"] + mb["evaluate_model"], mb["render_report"])
+    finish_min = max(minutes["export_model"], minutes["evaluate_model"]) + minutes["render_report"]
+    if not options.needs_descriptors:
+        unused |= {"learn_vocabulary", "describe_images"}
+    others = [stage for stage in STAGES[:first] if stage not in unused]
+    least, most = (pick(mb[stage] for stage in others) / 1000 for pick in (min, max))
+    shortest, longest = (pick(minutes[stage] for stage in others) for pick in (min, max))
+    tiles = blocks * (blocks + 1) // 2
+    # index_images, select_pairs, calibrate_cameras and the two groups
+    jobs = 5 + blocks + 2 * tiles + (1 + blocks) * options.needs_descriptors
+    cells = [
+        str(jobs),
+        f"{max(mb[stage] for stage in mapping) / 1000:.1f} GB, {mapping_min // 60} h {mapping_min % 60} min",
+        f"{finish_mb / 1000:.1f} GB, {finish_min} min",
+        f"{least:.1f} to {most:.1f} GB, {shortest} to {longest} min",
+    ]
+    lines = (root / "docs" / "guide.md").read_text().splitlines()
+    (row,) = [line for line in lines if line.startswith(f"| {images:,} | ")]
+    assert row.strip("| ").split(" | ")[2:] == cells
 
 
 @pytest.mark.parametrize(("side", "measured_mb"), [(760, 265), (1520, 864), (2200, 1739), (3000, 3180)])

@@ -1,5 +1,6 @@
 """Artifacts about pairs of images: select_pairs, match_pairs, estimate_two_view and the view graph."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -26,6 +27,11 @@ EDGE_LABELS = (
     "cycle_message",
     "cluster_vote",
 )
+
+
+def _numbered(names: Sequence[str]) -> str:
+    """The names behind the codes that stand for them, for docs/artifacts.md."""
+    return ", ".join(f"{code} {name}" for code, name in enumerate(names))
 
 
 @dataclass(frozen=True)
@@ -89,7 +95,7 @@ class TwoViewGeometries(Artifact):
         "covariance (rad) of the left rotation increment (3) and of the translation's two tangents",
     )
     kinds: Array = column("(P)", "int8", "0 general, 1 planar, 2 rotation-only")
-    rejections: Array = column("(P)", "int8", "0 accepted, else index of the reason for rejection")
+    rejections: Array = column("(P)", "int8", _numbered(("accepted", *REJECTIONS[1:])))
     match_counts: Array = column("(P)", "int32", "matches between distinct places whose rays are finite")
     inlier_counts: Array = column("(P)", "int32", "inlier matches")
     inlier_ratios: Array = column("(P)", "float64", "share of the matches that are inliers, see ratio_of")
@@ -111,7 +117,7 @@ class ViewGraph(Artifact):
     kinds: Array = column("(E)", "int8", "0 general, 1 planar, 2 rotation-only")
     inlier_counts: Array = column("(E)", "int32", "inlier matches")
     triangulation_angles_deg: Array = column("(E)", "float64", "median angle between the inliers' rays")
-    labels: Array = column("(E)", "int8", "0 kept, else index of the filter that refused the edge")
+    labels: Array = column("(E)", "int8", f"what refused the edge: {_numbered(EDGE_LABELS)}")
     cycle_min_deg: Array = column("(E)", "float64", "smallest 3-cycle error of the edge, NaN if in none")
     cycle_median_deg: Array = column("(E)", "float64", "median 3-cycle error of the edge, NaN if in none")
     components: Array = column("(N)", "int32", "component of each image by kept edges, 0 the largest")

@@ -14,7 +14,8 @@ class AdjustBundleOptions(StageOptions):
     stage_version: ClassVar[int] = 17
 
     solver: Literal["ceres", "gtsam"] = "ceres"
-    """Least-squares solver: Ceres through pycolmap, or gtsam (slower, fewer camera models)."""
+    """Least-squares solver: Ceres through pycolmap, or gtsam (slower, fewer camera models; principal
+    points are not refined, and fisheye lenses not recognised)."""
 
     thresholds_px: tuple[Annotated[float, Field(gt=0.0)], ...] = Field(
         default=(10.0, 5.0, 3.0), min_length=1, max_length=10
@@ -76,7 +77,8 @@ class AdjustBundleOptions(StageOptions):
     and kept fixed for the pass."""
 
     max_guessed_focal_change: float = Field(default=15.0, gt=1.0)
-    """Same limit for all other focal lengths, as a factor of 1.2 times the longer side."""
+    """Factor by which any other focal length, also one from matches, may differ from 1.2 times the
+    longer side before the camera is reset and kept fixed for the pass."""
 
     max_distortion: float = Field(default=1.0, gt=0.0)
     """Distortion above which a camera is reset and kept fixed for the pass, as the k of an equally
@@ -139,10 +141,12 @@ class AdjustBundleOptions(StageOptions):
     """Number of registered images above which the solver may work on a selection of the points."""
 
     early_observations: int = Field(default=300, ge=0)
-    """Then, observations per image used in early rounds, from the longest tracks; 0 uses all."""
+    """Observations per image used in early rounds of models with more than select_above_images images,
+    from the longest tracks; 0 uses all."""
 
     final_observations: int = Field(default=0, ge=0)
-    """Same for the last round and later ones; 0 uses all."""
+    """Observations per image used in the last round and later ones of models with more than
+    select_above_images images; 0 uses all. 1000 takes less memory and costs a little accuracy."""
 
     max_iterations: Annotated[int, Field(ge=1, le=1_000_000)] | Literal["auto"] = "auto"
     """Solver iterations per pass; 'auto' is 50, up to 500 in small models, where they are cheap."""

@@ -13,7 +13,8 @@ class AverageRotationsOptions(StageOptions):
     stage_version: ClassVar[int] = 6
 
     method: Literal["two_stage", "irls", "shonan"] = "two_stage"
-    """Averager: robust pass and covariance-weighted refinement, L1 and IRLS only, or Shonan averaging."""
+    """Averager: robust pass and covariance-weighted refinement, L1 and IRLS only, or Shonan averaging (with
+    the Huber loss and without a certificate where gtsam fails otherwise)."""
 
     max_residual_deg: float = Field(default=10.0, gt=0, le=180)
     """Edges that differ from the averaged rotations by more than a limit are refused; it adapts to the

@@ -23,7 +23,8 @@ class AverageTranslationsOptions(StageOptions):
     """Tracks are used, the longest first, until each camera has about this many rays."""
 
     recovery_rays_per_camera: int = Field(default=12, ge=0)
-    """Same for translation_recovery, which slows down with the number of landmarks."""
+    """Approximate number of rays per camera in translation_recovery, which slows down with the number of
+    landmarks."""
 
     ray_sigma_deg: float = Field(default=0.3, gt=0, le=10)
     """Expected error of a ray in degrees, mostly from its camera's averaged rotation."""

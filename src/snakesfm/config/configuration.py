@@ -90,12 +90,14 @@ class SceneInputs(Options):
     intrinsics: Literal["fixed", "refine"] = "fixed"
     """Whether bundle adjustment keeps known intrinsics fixed or refines them."""
     masks: str = ""
-    """Folder of masks, black where no keypoints are wanted: 'a/b.jpg.png' for 'a/b.jpg'; empty for none."""
+    """Folder of masks, black where no keypoints are wanted: 'a/b.jpg.png' or 'a/b.png' for 'a/b.jpg',
+    in the orientation in which the image is stored; not inside the image folder; empty for none."""
     pairs: str = ""
-    """Text file of image pairs, one 'name0 name1' per line, for select_pairs.method 'listed'; empty for
-    none."""
+    """Text file of image pairs, one 'name0 name1' per line, used instead of all others;
+    select_pairs.method must be 'auto' or 'listed'; empty for none."""
     imported: str = ""
-    """Folder with hloc's features.h5, matches.h5 and pairs.txt, for the front-end 'imported'."""
+    """Folder with hloc's features.h5, matches.h5 and, optionally, pairs.txt, for the front-end
+    'imported'."""
 
 
 FrontEndName = Literal[
@@ -134,7 +136,7 @@ class RunOptions(SceneInputs):
     scenes: dict[str, SceneInputs] = Field(default_factory=dict)
     """Several scenes: a mapping from name to images, cameras, masks and the other inputs of a scene."""
     seed: int = Field(default=0, ge=0)
-    """Seed of every random draw; the same seed gives the same model."""
+    """Seed of the random draws; the same seed gives the same model."""
     blocks: Annotated[int, Field(ge=1)] | Literal["auto"] = "auto"
     """Number of blocks the images are split into; B blocks give B(B+1)/2 tiles of pairs, one job each.
     'auto' depends on the number of images."""

@@ -11,7 +11,8 @@ class ExportModelOptions(StageOptions):
     stage_version: ClassVar[int] = 7
 
     georeference: Literal["auto"] | bool = "auto"
-    """Transform models to metres east, north and up by the GPS in EXIF; 'auto' does so if the two agree."""
+    """Transform models to metres east, north and up by the GPS in EXIF: 'auto' if the positions agree
+    with the model, true also if they are doubtful (with a warning), false never."""
 
     link_images: bool = True
     """Link the images next to the model, so that COLMAP and nerfstudio can read the folder directly."""
@@ -21,4 +22,5 @@ class ExportModelOptions(StageOptions):
     that COLMAP can continue the model and hloc can localise images in it; otherwise only observations."""
 
     undistort: bool = False
-    """Also write images, masks and a model with PINHOLE cameras to 'undistorted', for Inria's 3DGS."""
+    """Also write images, masks and a model with PINHOLE cameras to 'undistorted', for Inria's 3DGS.
+    Subfolders are kept, which its original code does not read."""

@@ -29,7 +29,8 @@ class ExtractFeaturesOptions(StageOptions):
     off."""
 
     max_shorter_side_px: int = Field(USUAL_SIDE_PX, ge=64, le=20_000)
-    """Shorter side to which larger images are scaled down; keypoint coordinates stay in original pixels."""
+    """Shorter side to which larger images are scaled down before keypoints are detected; raise
+    max_keypoints with it. Keypoint coordinates stay in original pixels."""
 
     contrast_threshold: float = Field(0.01, ge=0.0, le=0.5)
     """Smallest contrast of a SIFT keypoint, as in OpenCV; lower values find more keypoints in

@@ -19,13 +19,14 @@ class FilterViewGraphOptions(StageOptions):
     """Edges with a larger cycle error, in degrees, are refused."""
 
     min_cycles_per_edge: float = Field(default=6.0, ge=0)
-    """Message passing and vote refuse no edges if edges are in fewer 3-cycles on average."""
+    """If edges are in fewer 3-cycles than this on average, message passing and the vote after it refuse
+    none; average_rotations judges them."""
 
     first_pass: Literal["min", "median", "none"] = "min"
     """Error of an edge in the first pass of method 'cycles': its smallest or its median 3-cycle error."""
 
     second_pass: Literal["min", "median", "none"] = "median"
-    """Same for the second pass, which uses only edges kept by the first."""
+    """Error of an edge in the second pass of method 'cycles', which uses only edges kept by the first."""
 
     cluster_vote: bool = True
     """Let all inlier matches vote on how to connect groups of images that cycles do not connect."""

@@ -13,8 +13,9 @@ class IndexImagesOptions(StageOptions):
     stage_version: ClassVar[int] = 5
 
     camera_sharing: Literal["auto", "exif", "single", "per_folder", "per_image"] = "auto"
-    """Which images share a camera: 'auto' compares EXIF or, without it, folder and size; the others are
-    fixed rules."""
+    """Which images share a camera: 'auto' compares EXIF or, without it, folder, size and numbering;
+    'exif' only EXIF; 'single' all images of one size; 'per_folder' those of one folder and size;
+    'per_image' none."""
 
     camera_model: Literal[
         "auto",

@@ -28,7 +28,8 @@ class SelectPairsOptions(StageOptions):
         "listed",
     ] = "auto"
     """All pairs, neighbours by name, similar images, neighbours by GPS (by name where an image has none),
-    or your list; 'auto' takes your list, else all pairs of few images, else sequential+retrieval."""
+    or your list; 'auto' takes your list, else all pairs of up to exhaustive_up_to images, else
+    sequential+retrieval."""
 
     exhaustive_up_to: Annotated[int, Field(ge=2, le=100_000)] | Literal["auto"] = "auto"
     """Number of images up to which 'auto' takes all pairs; 'auto' is 1000 if pairs are previewed with
@@ -46,7 +47,7 @@ class SelectPairsOptions(StageOptions):
 
     preview_keypoints: int = Field(400, ge=0, le=10_000)
     """Number of largest SIFT keypoints per image with which proposed pairs are previewed before
-    matching; 0 turns the preview off."""
+    matching; 0 turns the preview off. Only with SIFT, and not for 'sequential' and 'listed'."""
 
     min_likeness: float = Field(1.5, ge=0.0)
     """Smallest likeness (preview score) of a pair that is matched; higher values leave out more pairs."""
@@ -55,8 +56,8 @@ class SelectPairsOptions(StageOptions):
     """Partners kept per image however small their likeness, the most similar first."""
 
     enough_partners: int = Field(30, ge=0, le=10_000)
-    """Partners kept per image (0 keeps all): one half are the most similar, the other half every second
-    one of those that follow."""
+    """Partners kept per image (0 keeps all): half of them are the most similar ones, the others are every
+    second one of the next most similar."""
 
     enough_likeness: float = Field(250.0, ge=0.0)
     """An image with weakly similar partners keeps more of them, until their likeness sums to this."""

@@ -1,4 +1,4 @@
-"""The README's figures are those of the measured results in docs/."""
+"""The figures of the README and of the overview are those of the measured results in docs/."""
 
 import re
 from pathlib import Path
@@ -9,7 +9,9 @@ import pytest
 from benchmarks.compare.results import GLOBAL, INCREMENTAL, OURS, OWN
 
 ROOT = Path(__file__).resolve().parents[3]
-README = (ROOT / "README.md").read_text(encoding="utf-8")
+PAGES = "\n".join(
+    (ROOT / name).read_text(encoding="utf-8") for name in ("README.md", "docs/benchmarks_overview.md")
+)
 METHODS = [OURS, INCREMENTAL, GLOBAL]
 SETS = {
     "Vesta": "astrovision_vesta_4",
@@ -36,7 +38,7 @@ def medians(page: str, image_set: str) -> pandas.DataFrame:
 
 def row_of(start: str) -> list[str]:
     """The cells of the only row that starts so."""
-    (row,) = [line for line in README.splitlines() if line.startswith(f"| {start}")]
+    (row,) = [line for line in PAGES.splitlines() if line.startswith(f"| {start}")]
     return [cell.strip(" *") for cell in row.strip("|").split("|")]
 
 
@@ -55,7 +57,7 @@ def test_accuracy_and_time_with_independent_references(name):
 
 
 def test_total_seconds_of_the_large_sets():
-    text = README.replace("\n", " ")
+    text = PAGES.replace("\n", " ")
     found = re.findall(r"\(([^()]+)\) (\d+) / (\d+) / (\d+)", text)
     assert len(found) == 3
     for name, *seconds in found:
