@@ -21,4 +21,5 @@ class ExportModelOptions(StageOptions):
     that COLMAP can continue the model and hloc can localise images in it; otherwise only observations."""
 
     undistort: bool = False
-    """Also write images, masks and a model with PINHOLE cameras to 'undistorted', for Inria's 3DGS."""
+    """Also write images, masks and a model with PINHOLE cameras to 'undistorted', for Inria's 3DGS. Up
+    to four images are undistorted at once; '--set-threads export_model=8' changes that to eight."""
