@@ -8,7 +8,7 @@ from snakesfm.config.base import StageOptions
 class ExportModelOptions(StageOptions):
     """How the model is written for other tools."""
 
-    stage_version: ClassVar[int] = 7
+    stage_version: ClassVar[int] = 8
 
     georeference: Literal["auto"] | bool = "auto"
     """Transform models to metres east, north and up by the GPS in EXIF; 'auto' does so if the two agree."""
