@@ -11,7 +11,7 @@ from snakesfm.rotation_averaging.base import edge_residuals
 from snakesfm.rotation_averaging.rejection import residual_limit
 from snakesfm.stages.average_translations import positioning_settings, translation_averager
 from snakesfm.translation_averaging.average import average_translations
-from snakesfm.translation_averaging.averagers import GlobalPositioning
+from snakesfm.translation_averaging.averagers import GlobalPositioning, with_rays
 from snakesfm.translation_averaging.problem import (
     PositioningProblem,
     direction_sigmas,
@@ -21,7 +21,6 @@ from snakesfm.translation_averaging.problem import (
 
 COLMAP_LOSS_SCALE = 0.1
 COLMAP_MIN_VIEWS = 3
-ALL_RAYS = 1 << 40
 # whether restarts help is no question here
 CHAIN = AverageTranslationsOptions(method="scale_chain", restarts=0)
 RECOVERY = AverageTranslationsOptions(method="translation_recovery")
@@ -57,13 +56,18 @@ def position_as_colmap(problem: PositioningProblem, seed: int) -> Array:
     """Pycolmap's global positioning with its default options: from random places, all longer tracks."""
     views = np.bincount(problem.ray_tracks)
     long = problem.select_rays(views[problem.ray_tracks] >= COLMAP_MIN_VIEWS)
-    return GlobalPositioning(ALL_RAYS, COLMAP_LOSS_SCALE, start=None).position(long, seed)
+    return GlobalPositioning(COLMAP_LOSS_SCALE, start=None).position(long, seed)
+
+
+def first_positions(problem: PositioningProblem, options: AverageTranslationsOptions, seed: int) -> Array:
+    """What the options' averager gives, which stage average_translations then refines and checks."""
+    return translation_averager(options).position(with_rays(problem, options.rays_per_camera), seed)
 
 
 POSITIONS: dict[str, Callable[[PositioningProblem, int], Array]] = {
     "scale_chain": chain_refined,
-    "scale_chain, not refined": translation_averager(CHAIN).position,
-    "translation_recovery": translation_averager(RECOVERY).position,
+    "scale_chain, not refined": lambda problem, seed: first_positions(problem, CHAIN, seed),
+    "translation_recovery": lambda problem, seed: first_positions(problem, RECOVERY, seed),
     "global_positioning": position_as_colmap,
 }
 """snakesfm's default is ``scale_chain``, the paper's ``translation_recovery``, GLOMAP's the last."""

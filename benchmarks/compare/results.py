@@ -5,13 +5,7 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from benchmarks.compare.measure import Cost
-from snakesfm.config.evaluate_model import EvaluateModelOptions
-from snakesfm.evaluation.colmap_model import model_poses, read_model
-from snakesfm.evaluation.metrics import evaluate_poses, model_metrics
-from snakesfm.grouping import offsets_of
 
 OURS = "snakesfm"
 INCREMENTAL = "colmap_incremental"
@@ -92,16 +86,3 @@ def read_results(folder: Path) -> list[Result]:
         if result.method == OURS
     ]
     return results + shared
-
-
-def evaluate(model_folder: Path, reference: Path) -> dict[str, Any]:
-    """The metrics of a model; reprojection errors are computed anew, alike for every method."""
-    model = read_model(model_folder)
-    model.update_point_3d_errors()
-    points = [model.points3D[key] for key in sorted(model.points3D)]
-    offsets = offsets_of([point.track.length() for point in points])
-    registered = np.array([image.has_pose for image in model.images.values()], dtype=bool)
-    errors_px = np.array([point.error for point in points], dtype=np.float64)
-    defaults = EvaluateModelOptions().model_dump()
-    evaluation = evaluate_poses(model_poses(model), model_poses(read_model(reference)), **defaults)
-    return {**model_metrics(registered, offsets, errors_px), **evaluation.metrics}

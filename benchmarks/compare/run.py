@@ -13,8 +13,9 @@ from pathlib import Path
 from benchmarks import ROOT
 from benchmarks.compare import methods
 from benchmarks.compare.measure import CommandError, Cost
-from benchmarks.compare.results import GLOBAL, INCREMENTAL, OPENMVG, OURS, OWN, SAME, Result, evaluate
+from benchmarks.compare.results import GLOBAL, INCREMENTAL, OPENMVG, OURS, OWN, SAME, Result
 from benchmarks.compare.sets import ImageSet
+from snakesfm.evaluation.scores import score_model
 
 OPERATIONS = {INCREMENTAL: "map_incremental", GLOBAL: "map_global"}
 LARGE_SET = 60
@@ -163,7 +164,7 @@ class Campaign:
         result = replace(result, date=datetime.now(UTC).strftime("%Y-%m-%d"))
         try:
             result = replace(result, stages=run())
-            result = replace(result, metrics=evaluate(model, image_set.reference))
+            result = replace(result, metrics=score_model(model, image_set.reference)[0])
         except CommandError as error:
             result = replace(result, failure=str(error), stages={"failed": error.cost})
         except Exception as error:

@@ -28,6 +28,7 @@ class Load:
     networks : number of networks that are run on each.
     batch : how many images or pairs a network holds in the job's memory at once.
     area : of the images in which keypoints are found, in those of the usual size.
+    undistorting : how many images are undistorted at once; 0 where none is.
     """
 
     images: float
@@ -35,6 +36,7 @@ class Load:
     networks: int = 0
     batch: int = 1
     area: float = 1.0
+    undistorting: int = 0
 
 
 @dataclass(frozen=True)
@@ -92,6 +94,11 @@ NEEDS = {
 # 2.0 GB more for every further image of 1140 x 760 in a batch
 NETWORK_MB, NETWORK_IMAGE_S, NETWORK_PAIR_S = 2600, 10.0, 17.0
 
+UNDISTORTING_THREADS = 4
+# each image of 24 megapixels, which is 72 MB decoded: one thread took 0.8 s for a JPEG of 6 megapixels, and
+# memory is estimated from the decoded and the undistorted image, and their copies where it is no JPEG
+UNDISTORTED_MB, UNDISTORTED_S = 500, 7.0
+
 
 def job_load(
     stage: str,
@@ -124,6 +131,7 @@ def memory_mb(stage: str, load: Load, attempt: int = 1) -> int:
     need = NEEDS[stage]
     own = need.constant_mb + need.image_mb * load.images + need.pair_mb * load.pairs
     own += (need.area_mb + NETWORK_MB * load.networks * load.batch) * load.area
+    own += UNDISTORTED_MB * load.undistorting
     return 100 * math.ceil((AROUND_MB + own) / 100) << (attempt - 1)
 
 
@@ -135,4 +143,6 @@ def runtime_min(stage: str, load: Load, attempt: int = 1) -> int:
     seconds += load.networks * (
         NETWORK_PAIR_S * load.pairs if load.pairs else NETWORK_IMAGE_S * load.images * load.area
     )
+    if load.undistorting:
+        seconds += UNDISTORTED_S * load.images / load.undistorting
     return (START_MIN + math.ceil(seconds / 60)) << (attempt - 1)

@@ -7,6 +7,7 @@ jobs is known before anything runs.
 import functools
 import json
 from collections.abc import Iterable, Mapping, Set
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +29,7 @@ from snakesfm.hloc_files import FEATURES, MATCHES, PAIRS
 from snakesfm.ingest.discover import MASK_DIGESTS_NAME, count_images, fingerprint_images
 from snakesfm.model_files import MODEL_FILES
 from snakesfm.pair_lists import estimate_pair_count, find_pair_list, pair_list_state
-from snakesfm.resources import Load, job_load
+from snakesfm.resources import UNDISTORTING_THREADS, Load, job_load
 
 SCENE_ARTIFACTS = (
     "index_images/index.h5",
@@ -236,15 +237,22 @@ class ScenePlan:
         """Most pairs that will be matched, as far as is known before anything runs."""
         return self.select_pairs.count_chosen(self.image_count, self.proposed_pair_count)
 
-    def load(self, stage: str) -> Load:
-        """What one job of a stage works on, on average over the blocks or tiles."""
+    @property
+    def undistorting_threads(self) -> int:
+        """The threads of export_model, which works on many images only where it undistorts them."""
+        return UNDISTORTING_THREADS if self.configuration.export_model.undistort else 1
+
+    def load(self, stage: str, threads: int = 1) -> Load:
+        """What one job of a stage works on with so many threads, on average over the blocks or tiles."""
         networks = len(self.models(stage))
         # a CUDA device holds its batches in memory of its own
         wanted = 1 if self.configuration.device == "cuda" else self.configuration.batch_size
         batch = 1 if wanted == "auto" else wanted
         pairs = self.proposed_pair_count if stage == "select_pairs" else self.pair_count
         side = self.configuration.extract_features.max_shorter_side_px
-        return job_load(stage, self.image_count, self.blocks, pairs, networks, batch, side)
+        load = job_load(stage, self.image_count, self.blocks, pairs, networks, batch, side)
+        undistorts = stage == "export_model" and self.configuration.export_model.undistort
+        return replace(load, undistorting=threads) if undistorts else load
 
     def final_files(self) -> list[str]:
         """What a person looks at: the scene's model, its metrics and its report."""

@@ -6,6 +6,7 @@ import pytest
 from snakesfm.config.average_translations import AverageTranslationsOptions
 from snakesfm.stages.average_translations import translation_averager
 from snakesfm.synthetic.problems import make_problem, perturb_rotations
+from snakesfm.translation_averaging.averagers import with_rays
 from snakesfm.translation_averaging.problem import PositioningProblem, edge_directions, world_rays
 
 
@@ -15,7 +16,7 @@ def positioning_problem(problem, rotations=None, min_length=3):
     rows = np.repeat(lengths >= min_length, lengths)
     images = problem.track_image_ids[rows].astype(np.int64)
     normalized = problem.cameras[0].normalize(problem.track_keypoints[rows])
-    return PositioningProblem(
+    whole = PositioningProblem(
         image_count=problem.image_count,
         pairs=problem.pairs.astype(np.int64),
         directions=edge_directions(rotations, problem.pairs, problem.edge_translations),
@@ -24,6 +25,7 @@ def positioning_problem(problem, rotations=None, min_length=3):
         ray_tracks=np.repeat(np.arange(len(lengths)), lengths)[rows],
         rays=world_rays(rotations, images, normalized),
     )
+    return with_rays(whole, AverageTranslationsOptions().rays_per_camera)
 
 
 def center_errors(estimated, truth):

@@ -7,7 +7,19 @@ import pytest
 from snakesfm.blocks import choose_blocks
 from snakesfm.config.configuration import STAGES
 from snakesfm.config.select_pairs import SelectPairsOptions
-from snakesfm.resources import NEEDS, START_MIN, Load, job_load, memory_mb, runtime_min
+from snakesfm.resources import (
+    NEEDS,
+    START_MIN,
+    UNDISTORTED_MB,
+    UNDISTORTED_S,
+    UNDISTORTING_THREADS,
+    Load,
+    job_load,
+    memory_mb,
+    runtime_min,
+)
+
+ASKING = (memory_mb, runtime_min)
 
 
 def test_every_stage_has_a_need() -> None:
@@ -17,7 +29,7 @@ def test_every_stage_has_a_need() -> None:
 @pytest.mark.parametrize("stage", STAGES)
 def test_more_work_and_further_attempts_never_ask_for_less(stage: str) -> None:
     small, large = Load(10, 45), Load(5_000, 100_000)
-    for ask in (memory_mb, runtime_min):
+    for ask in ASKING:
         assert 0 < ask(stage, small) <= ask(stage, large)
         assert ask(stage, large, 2) == 2 * ask(stage, large)
         assert ask(stage, large, 3) == 4 * ask(stage, large)
@@ -113,3 +125,18 @@ def test_a_network_asks_for_more() -> None:
         assert memory_mb(stage, with_one) == memory_mb(stage, without) + 2600
         assert 1 < runtime_min(stage, with_one) - runtime_min(stage, without) < 60
         assert memory_mb(stage, job_load(stage, 40, 2, pairs, 1, 3)) == memory_mb(stage, without) + 7800
+
+
+@pytest.mark.parametrize("threads", [1, UNDISTORTING_THREADS, 16])
+def test_undistorted_images_ask_for_their_time_and_the_memory_of_those_at_once(threads: int) -> None:
+    plain, undistorting = Load(5_000, 0), Load(5_000, 0, undistorting=threads)
+    more_mb, more_min = (ask("export_model", undistorting) - ask("export_model", plain) for ask in ASKING)
+    # an image of 24 megapixels takes twice 72 MB, and took one thread 3.2 s
+    assert 3 * 72 * threads < more_mb < 10 * 72 * threads
+    assert 1.5 * 3.2 < 60 * more_min * threads / 5_000 < 3 * 3.2
+
+
+def test_the_page_on_clusters_names_what_undistorted_images_ask_for(root: Path) -> None:
+    page = " ".join((root / "docs" / "cluster.md").read_text().split())
+    assert f"requests {UNDISTORTING_THREADS} threads, and per thread another {UNDISTORTED_MB} MB" in page
+    assert f"requests another {UNDISTORTED_S:g} s per image, divided by the threads" in page

@@ -58,7 +58,8 @@ def test_rule_writes_to_the_folder_of_its_name_and_runs_its_script(root: Path, s
     for directive in ("log_file", "job_params", "job_command", "memory_mb", "runtime_min"):
         assert re.findall(rf'{directive}\("(\w+)"', text) == [stage]
     assert re.findall(r'gpu=gpus\("(\w+)"', text) == [stage] * (stage in STAGES_WITH_NETWORKS)
-    assert re.findall(r"threads: (\d+)", text) == ["2"] * (stage in TWO_THREADS)
+    threads = ["2"] * (stage in TWO_THREADS) + ["undistorting_threads"] * (stage == "export_model")
+    assert re.findall(r"threads:\s+(\w+)", text) == threads
 
 
 @pytest.mark.parametrize("stage", STAGES)

@@ -88,6 +88,23 @@ def test_jobs_ask_for_memory_and_time(small_scene: Path, tmp_path: Path, name: s
     assert not [need for need in needs if "gpu=1" in need]
 
 
+@pytest.mark.parametrize(("cores", "given", "threads"), [(8, None, 4), (16, 8, 8)])
+def test_undistorted_images_have_threads_and_ask_for_their_memory(
+    tmp_path: Path, cores: int, given: int | None, threads: int
+) -> None:
+    images = tmp_path / "images"
+    images.mkdir()
+    for number in range(3):
+        (images / f"{number}.jpg").write_bytes(b"image %d" % number)
+    arguments = ["--set-threads", f"export_model={given}"] if given else []
+    options = [f"images={images}", "output=out", "export_model={undistort: true}"]
+    outcome = Workflow(tmp_path).run("--dry-run", *arguments, "--config", *options, cores=cores)
+    assert outcome.status == 0, outcome.text
+    job = re.search(r"^rule export_model:\n(.*?)^$", outcome.text, re.M | re.S)[1]
+    assert re.search(r"^ +threads: (\d+)$", job, re.M)[1] == str(threads)
+    assert 1_000 + 500 * (threads - 1) < int(re.search(r"mem_mb=(\d+)", job)[1]) <= 1_000 + 500 * threads
+
+
 @pytest.mark.parametrize(("name", "gpus"), [("slurm", 0), ("slurm-gpu", 5)])
 def test_networks_ask_for_a_gpu_where_the_profile_has_them(
     small_scene: Path, tmp_path: Path, name: str, gpus: int

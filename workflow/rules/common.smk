@@ -161,6 +161,11 @@ def job_command(stage):
     return f"{command} <<'END OF JOB'\n{{params.job}}\n{{params.files}}\n{{threads}}\n{{log}}\nEND OF JOB\n"
 
 
+def undistorting_threads(wildcards):
+    """The threads of export_model."""
+    return PLAN.scenes[wildcards.scene].undistorting_threads
+
+
 def memory_mb(stage):
     """A resource function: the memory that a job asks a cluster for."""
     return asking(resources.memory_mb, stage)
@@ -172,13 +177,14 @@ def runtime_min(stage):
 
 
 def asking(need, stage):
-    """A resource function of what a stage's job works on and of the attempt."""
+    """A resource function of what a stage's job works on, with how many threads, and of the attempt."""
 
-    def compute(wildcards, attempt):
+    def compute(wildcards, attempt, threads):
         # only the controller submits jobs, so only it needs the number of images
         if not workflow.is_main_process:
             return 1
-        return need(stage, PLAN.scenes[wildcards.scene].load(stage), attempt)
+        load = PLAN.scenes[wildcards.scene].load(stage, threads)
+        return need(stage, load, attempt)
 
     return compute
 

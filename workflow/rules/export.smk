@@ -63,6 +63,7 @@ rule export_model:
         [artifact("export_model", name) for name in MODEL_FILES],
     log:
         log_file("export_model"),
+    threads: undistorting_threads
     resources:
         mem_mb=memory_mb("export_model"),
         runtime=runtime_min("export_model"),

@@ -214,8 +214,11 @@ class _Mapper:
         skewed = skewed_cameras(self.reconstruction, self.cameras)
         if not skewed or settings.solver != "ceres":
             return
-        if not one_focal_serves(self.reconstruction, skewed, self.adjust, self.late_solving("last")):
+        solving = self.late_solving("last")
+        if not one_focal_serves(self.reconstruction, skewed, self.adjust, solving):
             return
+        # a model whose focal lengths were just changed does not show the noise of its keypoints
+        self.settings = replace(settings, loss_scale_px=solving.loss_scale_px)
         starts = list(self.cameras)
         for camera_id in skewed:
             set_one_focal(self.reconstruction, camera_id)
@@ -224,7 +227,7 @@ class _Mapper:
         for camera_id in skewed:
             camera = Camera.of_pycolmap(self.reconstruction.camera(camera_id))
             set_camera(self.reconstruction, camera_id, with_two_focals(camera, starts[camera_id - 1].model))
-        self.cameras = starts
+        self.cameras, self.settings = starts, settings
 
     def record(
         self,

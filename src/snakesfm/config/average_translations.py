@@ -1,6 +1,6 @@
 """Options of average_translations."""
 
-from typing import ClassVar, Literal
+from typing import ClassVar, Literal, Self
 
 from pydantic import Field
 
@@ -24,7 +24,7 @@ class AverageTranslationsOptions(StageOptions):
 
     recovery_rays_per_camera: int = Field(default=12, ge=0)
     """Approximate number of rays per camera in translation_recovery, which slows down with the number of
-    landmarks."""
+    landmarks; at most rays_per_camera."""
 
     ray_sigma_deg: float = Field(default=0.3, gt=0, le=10)
     """Expected error of a ray in degrees, mostly from its camera's averaged rotation."""
@@ -67,3 +67,8 @@ class AverageTranslationsOptions(StageOptions):
 
     max_relative_sigma: float = Field(default=0.1, gt=0)
     """Largest standard deviation of a camera centre, relative to the median distance to its landmarks."""
+
+    def resolved(self) -> Self:
+        """The options with no more rays for translation_recovery than there are for all methods."""
+        fewer = min(self.recovery_rays_per_camera, self.rays_per_camera)
+        return self.model_copy(update={"recovery_rays_per_camera": fewer})

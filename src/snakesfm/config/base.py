@@ -42,5 +42,5 @@ class StageOptions(Options):
         return json.dumps(self.model_dump(mode="json"), sort_keys=True)
 
     def resolved(self) -> Self:
-        """The options with 'auto' replaced where these options alone determine what it means."""
+        """The options as they are used, as far as these alone tell: 'auto' replaced, limits kept."""
         return self

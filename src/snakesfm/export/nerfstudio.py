@@ -102,12 +102,12 @@ def camera_intrinsics(camera: Camera) -> dict[str, Any]:
     return content | dict(zip(_term_names(camera), fitted, strict=True))
 
 
-def camera_warnings(camera: Camera, camera_id: int) -> list[str]:
-    """What a user of the exported camera should know: distortion that folds or is only approximate."""
-    warnings = []
+def camera_warnings(camera: Camera, camera_id: int) -> dict[str, str]:
+    """What a user of the exported camera should know, by kind: distortion that folds or is approximate."""
+    warnings: dict[str, str] = {}
     *_, held = _rays_of_grid(camera)
     if not held.all():
-        warnings.append(
+        warnings["folds"] = (
             f"camera {camera_id} ({camera.model}): the distortion is not invertible in the whole image, "
             "so undistorted images will show folds near their corners."
         )
@@ -115,12 +115,12 @@ def camera_warnings(camera: Camera, camera_id: int) -> list[str]:
         return warnings
     fit = _fit_terms(camera)
     if fit is None:
-        warnings.append(
+        warnings["no distortion"] = (
             f"camera {camera_id} ({camera.model}): too little of the image is within the lens's field of "
             "view to fit its distortion, so transforms.json has none: check the intrinsics."
         )
     elif fit[2] > FIT_PX:
-        warnings.append(
+        warnings["approximate"] = (
             f"camera {camera_id} ({camera.model}): transforms.json approximates the distortion "
             f"to {fit[2]:.1f} px."
         )

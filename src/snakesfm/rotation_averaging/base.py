@@ -67,7 +67,6 @@ class RotationAverager(ABC):
         rotations: Array,
         weights: Array | None = None,
         covariances: Array | None = None,
-        seed: int = 0,
     ) -> Array:
         """Average the largest connected component.
 
@@ -78,7 +77,6 @@ class RotationAverager(ABC):
         rotations : (E,3,3) float64, j_from_i.
         weights : (E,) trust in each edge, such as its inlier count; uniform if None.
         covariances : (E,3,3) rad^2, of the left increment of j_from_i; NaN or None where unknown.
-        seed : of every random draw.
 
         Returns
         -------
@@ -103,14 +101,14 @@ class RotationAverager(ABC):
             np.ones(int(chosen.sum())) if weights is None else np.maximum(weights, 1e-6)[chosen],
             np.full((int(chosen.sum()), 3, 3), np.nan) if covariances is None else covariances[chosen],
         )
-        solved = self.solve(graph, seed)
+        solved = self.solve(graph)
         averaged = np.full((node_count, 3, 3), np.nan)
         averaged[inside] = solved @ solved[0].T
         averaged[np.flatnonzero(inside)[0]] = np.eye(3)
         return averaged
 
     @abstractmethod
-    def solve(self, graph: RotationGraph, seed: int) -> Array:
+    def solve(self, graph: RotationGraph) -> Array:
         """Rotations (N,3,3) of a connected graph, cam_from_world in any gauge."""
 
 

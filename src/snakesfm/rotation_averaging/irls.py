@@ -35,7 +35,7 @@ class IrlsAverager(RotationAverager):
     l1_iterations: int = 15
     iterations: int = 30
 
-    def solve(self, graph: RotationGraph, seed: int) -> Array:
+    def solve(self, graph: RotationGraph) -> Array:
         """Rotations (N,3,3) of a connected graph."""
         start = tree_rotations(graph.node_count, graph.pairs, graph.rotations, 1.0 / graph.weights)
         return self.descend(graph, self.straighten(graph, start))

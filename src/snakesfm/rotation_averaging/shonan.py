@@ -33,7 +33,7 @@ class ShonanAverager(RotationAverager):
     p_min: int = 3
     p_max: int = 8
 
-    def solve(self, graph: RotationGraph, seed: int) -> Array:
+    def solve(self, graph: RotationGraph) -> Array:
         """Rotations (N,3,3) of a connected graph."""
         import gtsam
 

@@ -45,7 +45,7 @@ class TwoStageAverager(RotationAverager):
     rounds: int = 3
     iterations: int = 5
 
-    def solve(self, graph: RotationGraph, seed: int) -> Array:
+    def solve(self, graph: RotationGraph) -> Array:
         """Rotations (N,3,3) of a connected graph."""
         averaged = self._search(graph)
         for _ in range(self.rounds):

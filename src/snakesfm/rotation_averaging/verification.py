@@ -21,7 +21,6 @@ def average_rotation_components(
     largest_limit_deg: float,
     passes: int,
     min_images: int,
-    seed: int,
 ) -> tuple[Array, Array, Array]:
     """Average the largest component of the kept edges, then of what that leaves the largest, and so on.
 
@@ -38,7 +37,7 @@ def average_rotation_components(
     reasons : (E,) str; ``rotation_residual`` and ``component`` where refused here.
     components : (N,) int32 of the images that have a rotation, 0 the first; -1 for others.
     """
-    limits = (smallest_limit_deg, largest_limit_deg, passes, seed)
+    limits = (smallest_limit_deg, largest_limit_deg, passes)
     rotations = np.full((graph.node_count, 3, 3), np.nan)
     components = np.full(graph.node_count, -1, dtype=np.int32)
     judged = np.where(reasons == "kept", "component", reasons).astype(object)
@@ -68,7 +67,6 @@ def average_view_graph(
     smallest_limit_deg: float,
     largest_limit_deg: float,
     passes: int,
-    seed: int,
 ) -> tuple[Array, Array, Array]:
     """Average the kept edges, then take back refused ones that agree, and refuse kept ones that do not.
 
@@ -91,9 +89,7 @@ def average_view_graph(
 
     def average(chosen: Array) -> Array:
         part = graph.subset(chosen)
-        return averager.average(
-            part.node_count, part.pairs, part.rotations, part.weights, part.covariances, seed
-        )
+        return averager.average(part.node_count, part.pairs, part.rotations, part.weights, part.covariances)
 
     kept = reasons == "kept"
     components = label_components(graph.node_count, graph.pairs[kept])

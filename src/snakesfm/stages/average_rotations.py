@@ -51,7 +51,6 @@ def run(job: StageJob) -> None:
         options.max_residual_deg,
         options.passes,
         options.min_component_images,
-        job.seed_for(),
     )
     residuals = np.degrees(edge_residuals(graph.pairs, graph.rotations, rotations))
     CameraRotations(

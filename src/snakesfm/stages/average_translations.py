@@ -124,7 +124,7 @@ def positioning_settings(options: "AverageTranslationsOptions", seed: int) -> Po
         rays_per_camera=options.rays_per_camera,
         edge_weight=options.edge_weight,
         restarts=options.restarts,
-        restart=GlobalPositioning(options.rays_per_camera, options.positioning_loss_scale, start=None),
+        restart=GlobalPositioning(options.positioning_loss_scale, start=None),
         seed=seed,
     )
 
@@ -141,7 +141,6 @@ def translation_averager(options: "AverageTranslationsOptions") -> TranslationAv
         chain=None,
     )
     chain = ScaleChain(
-        rays_per_camera=options.rays_per_camera,
         sigma_rad=float(np.radians(options.ray_sigma_deg)),
         max_relative_sigma=options.max_relative_sigma,
         fallback=recovery,
@@ -150,7 +149,7 @@ def translation_averager(options: "AverageTranslationsOptions") -> TranslationAv
         return replace(recovery, chain=chain)
     if options.method == "global_positioning":
         start = chain if options.positioning_start == "chain" else None
-        return GlobalPositioning(options.rays_per_camera, options.positioning_loss_scale, start)
+        return GlobalPositioning(options.positioning_loss_scale, start)
     return chain
 
 

@@ -78,6 +78,10 @@ CUT_PICTURE = (
     "holds a view of about 180 degrees: use images/ and sparse/0 with software for fisheye lenses."
 )
 
+# of each kind: every image of a collection may have a camera of its own
+MOST_CAMERAS = 5
+MORE_CAMERAS = "{count} more cameras have the problem of the warning before this one."
+
 # of a picture, what is left of it without distortion: normal lenses keep 0.8 and more
 LEAST_UNDISTORTED = 0.5
 # more of them add nothing about a lens
@@ -162,21 +166,31 @@ def _warnings(
 
 def _camera_warnings(adjusted: Reconstruction, cameras: dict[int, Camera]) -> list[str]:
     """What other tools cannot do with cameras, given by rows, and what bundle adjustment could not."""
-    warnings = [line for row, camera in cameras.items() for line in camera_warnings(camera, row + 1)]
-    warnings += [
+    by_kind: dict[str, list[str]] = {}
+    for row, camera in cameras.items():
+        for kind, line in camera_warnings(camera, row + 1).items():
+            by_kind.setdefault(kind, []).append(line)
+    by_kind["reset"] = [
         RESET_CAMERA.format(camera=row + 1, model=camera.model, cause=adjusted.camera_resets[row])
         for row, camera in cameras.items()
         if adjusted.camera_resets[row]
     ]
-    return warnings + [
+    by_kind["far"] = [
         FAR_PRINCIPAL_POINT.format(camera=row + 1, model=camera.model, offset=adjusted.camera_offsets[row])
         for row, camera in cameras.items()
         if np.isfinite(adjusted.camera_offsets[row])
     ]
+    return [line for lines in by_kind.values() for line in _some_cameras(lines)]
+
+
+def _some_cameras(lines: list[str]) -> list[str]:
+    """Of warnings of one kind, a sentence per camera, the first, and of how many more they are true."""
+    more = len(lines) - MOST_CAMERAS
+    return lines if more < 2 else [*lines[:MOST_CAMERAS], MORE_CAMERAS.format(count=more)]
 
 
 def _lens_warnings(model: Reconstruction, cameras: list[Camera], camera_ids: np.ndarray) -> list[str]:
-    """One sentence per camera whose lens is not of its model."""
+    """A sentence per camera whose lens is not of its model."""
     some = slice(None, None, -(-len(model.image_ids) // OBSERVATIONS_OF_LENSES) or 1)
     images = model.image_ids[some]
     points = model.points[np.repeat(np.arange(len(model.points)), np.diff(model.offsets))[some]]
@@ -184,21 +198,25 @@ def _lens_warnings(model: Reconstruction, cameras: list[Camera], camera_ids: np.
     fits = fit_lenses(
         dict(enumerate(cameras)), camera_ids[images], images, in_camera, model.keypoints[some]
     )
-    return [
-        OTHER_LENS.format(camera=row + 1, model=cameras[row].model)
-        for row, fit in fits.items()
-        if fit.misfit > MAX_MISFIT
-    ]
+    return _some_cameras(
+        [
+            OTHER_LENS.format(camera=row + 1, model=cameras[row].model)
+            for row, fit in fits.items()
+            if fit.misfit > MAX_MISFIT
+        ]
+    )
 
 
 def _cut_warnings(cameras: dict[int, Camera]) -> list[str]:
-    """One sentence per camera, given by its row, of whose pictures little is left without distortion."""
+    """A sentence per camera, given by its row, of whose pictures little is left without distortion."""
     shares = {row: undistorted_share(camera) for row, camera in cameras.items()}
-    return [
-        CUT_PICTURE.format(camera=row + 1, model=cameras[row].model, share=share)
-        for row, share in shares.items()
-        if share < LEAST_UNDISTORTED
-    ]
+    return _some_cameras(
+        [
+            CUT_PICTURE.format(camera=row + 1, model=cameras[row].model, share=share)
+            for row, share in shares.items()
+            if share < LEAST_UNDISTORTED
+        ]
+    )
 
 
 def _masks(folder: Path | None, cameras: dict[str, Camera], warnings: list[str]) -> dict[str, str]:

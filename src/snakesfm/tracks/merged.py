@@ -30,18 +30,10 @@ def compare_track_lengths(
     -------
     unmerged, merged : (U,) and (V,) int64, entry k is the number of connected components seen in k images.
     """
-    trees = {image: MergedKeypoints(keypoints[image]) for image in np.unique(pairs).tolist()}
-    raw, merged = [np.zeros((0, 2, 3))], [np.zeros((0, 2, 3))]
-    for row, (i, j) in enumerate(pairs.tolist()):
-        inliers = matches[offsets[row] : offsets[row + 1]].astype(np.int64)
-        rows = np.stack([inliers, np.zeros_like(inliers)], axis=2)
-        merged.append(_ends(i, j, rows[:, 0], rows[:, 1]))
-        places = found(i, j)
-        first = trees[i].nearest(places[:, :2], np.inf)
-        second = trees[j].nearest(places[:, 2:], np.inf)
-        among = np.isin(first * len(keypoints[j]) + second, inliers @ [len(keypoints[j]), 1])
-        raw.append(_ends(i, j, places[among, :2], places[among, 2:]))
-    return _lengths(np.concatenate(raw)), _lengths(np.concatenate(merged))
+    images = pairs.astype(np.int32)
+    merged = _lengths(np.repeat(images, np.diff(offsets), axis=0), matches[offsets[0] : offsets[-1]])
+    counts, places = _places_as_found(keypoints, pairs, offsets, matches, found)
+    return _lengths(np.repeat(images, counts, axis=0), places), merged
 
 
 def describe_lengths(histogram: Array) -> str:
@@ -53,17 +45,44 @@ def describe_lengths(histogram: Array) -> str:
     return f"{count:,} tracks of {mean:.2f} images on average, {100 * histogram[2] / count:.0f} % in two"
 
 
-def _ends(i: int, j: int, first: Array, second: Array) -> Array:
-    """Both ends (M,2,3) of matches: the image and two numbers that tell its places apart."""
-    sides = ((i, first), (j, second))
-    ends = [np.insert(part.astype(np.float64), 0, image, axis=1) for image, part in sides]
-    return np.stack(ends, axis=1)
+def _places_as_found(
+    keypoints: list[Array],
+    pairs: Array,
+    offsets: Array,
+    matches: Array,
+    found: Callable[[int, int], Array],
+) -> tuple[Array, Array]:
+    """How many places of each pair (P,) are of its matches, and these in image i and in image j (K,2).
+
+    A place is one int64, which holds its two coordinates.
+    """
+    trees = {image: MergedKeypoints(keypoints[image]) for image in np.unique(pairs).tolist()}
+    chosen = [np.zeros((0, 2), np.int64)]
+    for row, (i, j) in enumerate(pairs.tolist()):
+        inliers = matches[offsets[row] : offsets[row + 1]].astype(np.int64)
+        places = found(i, j)
+        first = trees[i].nearest(places[:, :2], np.inf)
+        second = trees[j].nearest(places[:, 2:], np.inf)
+        among = np.isin(first * len(keypoints[j]) + second, inliers @ [len(keypoints[j]), 1])
+        # -0 is where 0 is, but has other bits
+        coordinates = np.ascontiguousarray(places[among], np.float32) + np.float32(0)
+        chosen.append(coordinates.view(np.int64))
+    return np.array([len(part) for part in chosen[1:]], np.int64), np.concatenate(chosen)
 
 
-def _lengths(ends: Array) -> Array:
-    if len(ends) == 0:
+def _lengths(images: Array, places: Array) -> Array:
+    """Histogram of the lengths of the tracks of matches, whose two ends (M,2) int are places in images."""
+    if len(images) == 0:
         return np.zeros(0, np.int64)
-    distinct, flat = np.unique(ends.reshape(-1, 3), axis=0, return_inverse=True)
-    labels = components_of(len(distinct), flat.reshape(-1, 2))
-    seen = np.unique(np.column_stack([labels, distinct[:, 0].astype(np.int64)]), axis=0)[:, 0]
+    image_of, place_of = images.ravel(), places.ravel()
+    order = np.lexsort((place_of, image_of))
+    image_of, place_of = image_of[order], place_of[order]
+    first = np.ones(len(order), bool)
+    first[1:] = (image_of[1:] != image_of[:-1]) | (place_of[1:] != place_of[:-1])
+    nodes = np.empty(len(order), np.int64)
+    nodes[order] = np.cumsum(first) - 1
+    image_of = image_of[first].astype(np.int64)
+    labels = components_of(len(image_of), nodes.reshape(-1, 2))
+    count = int(image_of.max()) + 1
+    seen = np.unique(labels * count + image_of) // count
     return np.bincount(np.bincount(seen), minlength=3).astype(np.int64)

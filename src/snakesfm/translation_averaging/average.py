@@ -1,6 +1,6 @@
 """From directions to checked centres: first guess, refinement, weak cameras, gauge, residuals."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -30,10 +30,10 @@ class PositioningSettings:
     averager : gives the first positions.
     limits : what holds a camera in place.
     refine : whether the first positions are refined by the angles of rays and edges.
-    rays_per_camera : about how many take part in all but the first positions.
+    rays_per_camera : about how many take part.
     edge_weight : of an edge relative to a ray in the refinement.
     restarts : random starts that are tried where few rays agree with the positions.
-    restart : what starts, with more rays.
+    restart : what starts, given more rays.
     seed : of what is drawn.
     """
 
@@ -88,8 +88,9 @@ def average_translations(problem: PositioningProblem, settings: PositioningSetti
     """
     limits = settings.limits
     part = largest_part(problem)
+    thinned = with_rays(part, settings.rays_per_camera)
     # what is worked out per track must cost as much as there are rays, not as the highest number tells
-    chosen = with_rays(part, settings.rays_per_camera).number_tracks()[0]
+    chosen = thinned.number_tracks()[0]
     images = part.images()
     if len(images) < 2:
         centers = np.full((problem.image_count, 3), np.nan)
@@ -98,17 +99,17 @@ def average_translations(problem: PositioningProblem, settings: PositioningSetti
         centers[part.pairs[0, 0]] = 0.0
         centers[part.pairs[0, 1]] = part.directions[0]
     else:
-        first = settings.averager.position(part, settings.seed)
+        first = settings.averager.position(thinned, settings.seed)
         centers = _checked_positions(chosen, first, settings)
         if settings.restarts and agreeing_share(chosen, centers, limits) < DOUBTFUL_SHARE:
             # look-alikes make wrong edges and the longest tracks: more rays, without edges, may agree
             few = settings.rays_per_camera
             many = max(few, min(MORE_RAYS * few, MOST_RAYS // len(images)))
-            restart = replace(settings.restart, rays_per_camera=many)
             more, whole = with_rays(part, many).number_tracks()[0], part.number_tracks()[0]
             best = max(agreeing_share(whole, centers, limits), LEAST_SHARE)
             for start in range(settings.restarts):
-                other = _checked_positions(more, restart.position(part, settings.seed + start), settings)
+                other = settings.restart.position(more, settings.seed + start)
+                other = _checked_positions(more, other, settings)
                 share = agreeing_share(whole, other, limits)
                 if share > best:
                     chosen, centers, best = more, other, share

@@ -23,7 +23,7 @@ class TranslationAverager(Protocol):
     def position(self, problem: PositioningProblem, seed: int) -> Array:
         """Centres (N,3) in the frame of the rotations, up to scale and shift; NaN where there is none.
 
-        The problem is connected, and has at least three images.
+        The problem is connected, has at least three images, and the rays that are to take part.
         """
 
 
@@ -35,7 +35,6 @@ class ScaleChain:
     instead.
     """
 
-    rays_per_camera: int
     sigma_rad: float
     max_relative_sigma: float
     fallback: TranslationAverager
@@ -47,8 +46,7 @@ class ScaleChain:
 
     def link(self, problem: PositioningProblem) -> Array | None:
         """Centres (N,3), or None where the landmarks link fewer than half of the cameras."""
-        rays = with_rays(problem, self.rays_per_camera)
-        centers = chain_centers(rays, 1.5 * self.sigma_rad, self.max_relative_sigma)
+        centers = chain_centers(problem, 1.5 * self.sigma_rad, self.max_relative_sigma)
         return None if 2 * np.isfinite(centers[:, 0]).sum() < len(problem.images()) else centers
 
 
@@ -59,6 +57,7 @@ class TranslationRecovery:
     With the outlier rejection of 1DSfM (Wilson and Snavely, ECCV 2014; ``mfas``), or by the residuals of a
     first solution (``residual``). It starts at random places. Directions alone may agree with parts of the
     scene at scales of their own; where landmarks say otherwise, ``chain`` is used instead, if there is one.
+    Of the rays about ``rays_per_camera`` take part, but for the chain.
     """
 
     rays_per_camera: int
@@ -102,7 +101,6 @@ class GlobalPositioning:
     It starts at the centres of ``start``, or at random ones if None, as in GLOMAP.
     """
 
-    rays_per_camera: int
     loss_scale: float
     start: ScaleChain | None
 
@@ -111,7 +109,7 @@ class GlobalPositioning:
         from snakesfm.translation_averaging.positioning import position_globally
 
         start = self.start.position(problem, seed) if self.start else None
-        return position_globally(with_rays(problem, self.rays_per_camera), start, self.loss_scale, seed)
+        return position_globally(problem, start, self.loss_scale, seed)
 
 
 def with_rays(problem: PositioningProblem, rays_per_camera: int) -> PositioningProblem:

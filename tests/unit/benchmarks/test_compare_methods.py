@@ -8,9 +8,9 @@ import pytest
 
 from benchmarks.compare.measure import CommandError, run_measured, run_operation
 from benchmarks.compare.methods import colmap_map
-from benchmarks.compare.results import evaluate
 from benchmarks.compare.sets import ImageSet, read_sets
 from snakesfm.errors import ConfigError
+from snakesfm.evaluation.scores import score_model
 
 IMAGES = 6
 
@@ -79,7 +79,7 @@ def test_colmaps_mappers_run_on_a_copy_of_a_database(
     assert database.read_bytes() == before
     assert not (tmp_path / "run" / "database.db").exists()
     assert cost.cpu_seconds > 0
-    metrics = evaluate(tmp_path / "run" / "model", image_set.reference)
+    metrics, _ = score_model(tmp_path / "run" / "model", image_set.reference)
     assert metrics["registered_images"] == IMAGES
     assert 99.0 < metrics["relative_pose_auc_1deg"] <= 100.0
 

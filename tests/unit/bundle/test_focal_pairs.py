@@ -93,6 +93,31 @@ def test_upright_cameras_around_an_object_get_one_focal_length(model, monkeypatc
     assert [record.name for record in records][-1] == "last pass with one focal length"
 
 
+def test_the_pass_with_one_focal_length_has_the_loss_of_the_noise(monkeypatch):
+    monkeypatch.setitem(layouts.LAYOUTS, "ring", upright_ring)
+    true, start = camera_of("PINHOLE", 500.0, 500.0), camera_of("PINHOLE", 550.0, 550.0)
+    made = make_problem(16, 800, "ring", noise_px=0.3, camera=true, seed=3)
+    passes = []
+
+    def adjuster(solver):
+        adjust = bundle_adjuster(solver)
+
+        def record(reconstruction, solving):
+            passes.append((reconstruction.camera(1).model_name, solving.loss_scale_px))
+            return adjust(reconstruction, solving)
+
+        return record
+
+    monkeypatch.setattr("snakesfm.bundle.rounds.bundle_adjuster", adjuster)
+    _, records = run_rounds(made, replace(true_model(made), cameras=(start,)))
+    assert records[-1].name == "last pass with one focal length"
+    (trial, tried), (last, used) = passes[-2:]
+    assert trial == last == "SIMPLE_PINHOLE"
+    assert used == tried
+    # 3.5 deviations of the keypoints' noise
+    assert 0.8 < used / (3.5 * 0.3) < 1.25
+
+
 @pytest.mark.parametrize("model", ["PINHOLE", "OPENCV"])
 @pytest.mark.parametrize("fy", [480.0, 400.0])
 def test_pixels_that_are_not_square_stay_so(model, fy):

@@ -5,7 +5,9 @@ import json
 import numpy as np
 import pycolmap
 import pytest
+from synthetic_scene import true_model
 
+from snakesfm.bundle.model import to_reconstruction
 from snakesfm.config.evaluate_model import EvaluateModelOptions
 from snakesfm.errors import ConfigError
 from snakesfm.evaluation.__main__ import main
@@ -18,6 +20,7 @@ from snakesfm.evaluation.pose_errors import (
     pose_auc,
     relative_pose_errors,
 )
+from snakesfm.evaluation.scores import score_model
 from snakesfm.geometry.poses import center_of, translation_of
 from snakesfm.geometry.rotations import angle_of, exp_so3
 from snakesfm.image_names import match_names
@@ -301,6 +304,23 @@ def test_a_real_reference_scores_against_itself_from_text_and_from_binary(data, 
     assert content["registered_images"] == 11
     assert content["relative_pose_auc_1deg"] == pytest.approx(100.0, abs=1e-3)
     assert content["per_image"]["0000.jpg"]["position_error"] == pytest.approx(0.0, abs=1e-6)
+
+
+@pytest.mark.parametrize("stored_px", [-1.0, 7.0])
+def test_reprojection_errors_are_computed_whatever_a_tool_stored(tmp_path, capsys, stored_px) -> None:
+    made = make_problem(camera_count=6, point_count=200, noise_px=0.5)
+    model = to_reconstruction(true_model(made), made.keypoints, [f"{k}.jpg" for k in range(6)])
+    for point in model.points3D.values():
+        point.error = stored_px
+    model.write_binary(str(tmp_path))
+    assert read_model(tmp_path).points3D[1].error == stored_px
+    assert main([str(tmp_path), str(tmp_path)]) == 0
+    content = json.loads(capsys.readouterr().out)
+    # the length of a 2D Gaussian of 0.5 px has mean 0.5 sqrt(pi / 2)
+    assert 0.59 < content["reprojection_error_px_mean"] < 0.66
+    assert 0.5 < content["reprojection_error_px_median"] < 0.66
+    metrics, evaluation = score_model(tmp_path, tmp_path)
+    assert metrics == content and set(evaluation.metrics) < set(metrics)
 
 
 def test_a_folder_without_a_model_and_a_damaged_one_end_with_one_sentence(tmp_path, capsys) -> None:

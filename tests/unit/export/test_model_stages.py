@@ -8,6 +8,7 @@ import struct
 import sys
 from collections.abc import Iterable
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -574,6 +575,42 @@ def test_pictures_of_which_little_is_left_without_distortion_are_warned_of(
         found = [line for line in summary["warnings"] if "undistorted/ shows only" in line]
         assert len(found) == count
         assert all(line.startswith(f"camera {row} (FOV)") for row, line in enumerate(found, start=1))
+
+
+@pytest.mark.parametrize(("count", "named"), [(6, 6), (60, 5)])
+def test_a_problem_of_many_cameras_is_told_of_some(monkeypatch, count: int, named: int) -> None:
+    folding = Camera("SIMPLE_RADIAL", 640, 480, (300.0, 320.0, 240.0, -1.2))
+    wide = Camera("FOV", 640, 480, (250.0, 250.0, 320.0, 240.0, 1.4))
+    adjusted = SimpleNamespace(camera_resets=["distortion"] * count, camera_offsets=np.full(count, 0.07))
+    one = SimpleNamespace(
+        image_ids=np.zeros(1, int),
+        points=np.ones((1, 3)),
+        offsets=np.array([0, 1]),
+        rotations=np.eye(3)[None],
+        translations=np.zeros((1, 3)),
+        keypoints=np.zeros((1, 2)),
+    )
+    misfits = dict.fromkeys(range(count), SimpleNamespace(misfit=np.inf))
+    monkeypatch.setattr(export_model, "fit_lenses", lambda *_: misfits)
+    monkeypatch.setattr(export_model, "undistorted_share", lambda _: 0.1)
+    told = {
+        ("not invertible", "reset and kept fixed", "max_principal_point_offset"): (
+            export_model._camera_warnings(adjusted, dict.fromkeys(range(count), folding))
+        ),
+        ("does not describe the lens",): export_model._lens_warnings(
+            one, [folding] * count, np.zeros(1, int)
+        ),
+        ("undistorted/ shows only",): export_model._cut_warnings(dict.fromkeys(range(count), wide)),
+    }
+    for kinds, warnings in told.items():
+        for kind in kinds:
+            found = [line for line in warnings if kind in line]
+            assert [line.split()[1] for line in found] == [str(k + 1) for k in range(named)]
+        more = [line for line in warnings if "more cameras have the problem" in line]
+        assert more == ["55 more cameras have the problem of the warning before this one."] * (
+            len(kinds) if count > named else 0
+        )
+        assert len(warnings) == len(kinds) * named + len(more)
 
 
 def test_masks_go_with_the_images_where_all_have_one_of_their_size(tmp_path, problem) -> None:

@@ -1,9 +1,12 @@
 """Track lengths with and without merging."""
 
 import itertools
+import tracemalloc
 
 import numpy as np
+import pytest
 
+from snakesfm.grouping import components_of, offsets_of
 from snakesfm.tracks.merged import compare_track_lengths, describe_lengths
 
 
@@ -44,3 +47,49 @@ def test_no_pairs_have_no_tracks():
     )
     assert len(unmerged) == len(merged) == 0
     assert describe_lengths(unmerged) == "no tracks"
+
+
+def plain_lengths(ends):
+    """Lengths of the tracks of matches (M,2,3), whose ends are an image and two coordinates."""
+    distinct, flat = np.unique(ends.reshape(-1, 3), axis=0, return_inverse=True)
+    labels = components_of(len(distinct), flat.reshape(-1, 2))
+    seen = np.unique(np.column_stack([labels, distinct[:, 0]]), axis=0)[:, 0].astype(int)
+    return np.bincount(np.bincount(seen), minlength=3)
+
+
+def matches_among(images, keypoint_count, match_count, seed):
+    """Keypoints on a grid around zero, random matches of all pairs, and where pairs found them."""
+    rng = np.random.default_rng(seed)
+    grid = np.mgrid[-400:400:10, -20:30:10].reshape(2, -1).T[:keypoint_count].astype(np.float32)
+    pairs = np.array(list(itertools.combinations(range(images), 2)))
+    matches, found = [], {}
+    for i, j in pairs.tolist():
+        rows = np.stack([rng.permutation(keypoint_count)[:match_count] for _ in range(2)], axis=1)
+        # of few places, some with a zero that has a sign
+        places = np.hstack([grid[rows[:, 0]], grid[rows[:, 1]]]) + rng.integers(0, 2, (match_count, 4))
+        found[i, j] = (places * rng.choice([-1, 1], places.shape) ** (places == 0)).astype(np.float32)
+        matches.append(rows.astype(np.int32))
+    return [grid] * images, pairs, offsets_of([len(m) for m in matches]), np.concatenate(matches), found
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_lengths_are_those_of_components_of_places(seed):
+    keypoints, pairs, offsets, matches, found = matches_among(6, 300, 60, seed)
+    unmerged, merged = compare_track_lengths(keypoints, pairs, offsets, matches, lambda i, j: found[i, j])
+    images = np.repeat(pairs, np.diff(offsets), axis=0)[:, :, None]
+    places = np.concatenate([found[i, j] for i, j in pairs.tolist()])
+    assert (np.signbit(places) & (places == 0)).any()
+    raw = np.concatenate([images, places.reshape(-1, 2, 2).astype(float)], axis=2)
+    rows = np.concatenate([images, matches[:, :, None], 0 * images], axis=2)
+    np.testing.assert_array_equal(unmerged, plain_lengths(raw))
+    np.testing.assert_array_equal(merged, plain_lengths(rows))
+    assert len(unmerged) > 3 and len(merged) > 3
+
+
+def test_a_match_takes_little_memory():
+    keypoints, pairs, offsets, matches, found = matches_among(30, 400, 400, 0)
+    tracemalloc.start()
+    compare_track_lengths(keypoints, pairs, offsets, matches, lambda i, j: found[i, j])
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert 80 < peak / len(matches) < 200

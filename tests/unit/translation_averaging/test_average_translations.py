@@ -58,6 +58,11 @@ def positioning(truth, rotations=None):
     )
 
 
+def thinned(problem):
+    """The rays that averagers are given."""
+    return with_rays(problem, SETTINGS.rays_per_camera)
+
+
 def errors(centers, truth):
     known = np.isfinite(centers[:, 0])
     a = centers[known] - np.median(centers[known], axis=0)
@@ -138,6 +143,41 @@ def test_cover_gives_each_camera_its_rays_with_whole_tracks():
     assert 0 < mask.sum() < len(mask)
     for track in np.unique(problem.ray_tracks[mask])[:20]:
         assert mask[problem.ray_tracks == track].all()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_cover_of_a_cover_is_that_of_all_rays(seed):
+    problem = positioning(make_problem(30, 2000, "street", seed=seed))
+    some = with_rays(problem, 40)
+    for rays_per_camera in (40, 12, 1):
+        whole, again = with_rays(problem, rays_per_camera), with_rays(some, rays_per_camera)
+        assert 0 < len(whole.rays) < len(problem.rays)
+        for name, values in vars(whole).items():
+            np.testing.assert_array_equal(getattr(again, name), values)
+
+
+@pytest.mark.parametrize("method", ["scale_chain", "global_positioning"])
+def test_tracks_are_chosen_once_and_once_more_for_all_restarts(method, monkeypatch):
+    problem = positioning(make_problem(12, 600, "area", noise_px=0.3, seed=3))
+    told = []
+
+    def cover(images, tracks, count, rays_per_camera):
+        told.append((len(images), rays_per_camera))
+        return cover_cameras(images, tracks, count, rays_per_camera)
+
+    monkeypatch.setattr("snakesfm.translation_averaging.averagers.cover_cameras", cover)
+    monkeypatch.setattr("snakesfm.translation_averaging.average.DOUBTFUL_SHARE", 1.1)
+    average_translations(problem, settings(method=method, refine=False, restarts=2, rays_per_camera=20))
+    assert told == [(len(problem.rays), 20), (len(problem.rays), 300)]
+
+
+def test_recovery_has_no_more_rays_than_take_part():
+    for rays, recovery, used in ((100, 12, 12), (10, 12, 10), (100, 300, 100)):
+        options = AverageTranslationsOptions(rays_per_camera=rays, recovery_rays_per_camera=recovery)
+        assert options.resolved().recovery_rays_per_camera == used
+        assert options.resolved().rays_per_camera == rays
+    usual = AverageTranslationsOptions()
+    assert usual.resolved() == usual
 
 
 def test_intersect_ignores_a_wrong_line_and_flags_parallel_ones():
@@ -399,7 +439,7 @@ def test_whole_averaging_with_noise_and_outliers(layout):
 @pytest.mark.parametrize("seed", [1, 2])
 def test_scale_chain_withstands_a_third_of_wrong_pairs(seed):
     truth = make_problem(30, 1500, "area", 0.7, 0.1, 0.3, 0.35, seed=seed)
-    found = errors(CHAIN.position(positioning(truth), 0), truth.centers)
+    found = errors(CHAIN.position(thinned(positioning(truth)), 0), truth.centers)
     assert len(found) == 30
     assert 1e-4 < np.median(found) < 0.004 and found.max() < 0.04
 
@@ -510,7 +550,8 @@ def test_loss_scale_of_global_positioning_says_which_rays_count():
         averager("global_positioning", positioning_loss_scale=scale, positioning_start="chain")
         for scale in (1e-3, 10.0)
     )
-    found = [errors(a.position(positioning(truth), 0), truth.centers) for a in (robust, plain)]
+    problem = thinned(positioning(truth))
+    found = [errors(a.position(problem, 0), truth.centers) for a in (robust, plain)]
     assert 1e-4 < np.median(found[0]) < 0.1 * np.median(found[1])
 
 
@@ -519,7 +560,7 @@ def test_loss_scale_of_global_positioning_says_which_rays_count():
     [{"method": "translation_recovery"}, {"method": "global_positioning", "positioning_start": "chain"}],
 )
 def test_the_chain_of_other_averagers_has_the_options_of_its_own(options, monkeypatch):
-    problem = positioning(make_problem(10, 600, "area", seed=3))
+    problem = with_rays(positioning(make_problem(10, 600, "area", seed=3)), 20)
     told = []
 
     def chain(rays, *limits):
@@ -527,10 +568,10 @@ def test_the_chain_of_other_averagers_has_the_options_of_its_own(options, monkey
         return chain_centers(rays, *limits)
 
     monkeypatch.setattr("snakesfm.translation_averaging.averagers.chain_centers", chain)
-    few = {"rays_per_camera": 20, "ray_sigma_deg": 0.5, "max_relative_sigma": 0.2}
+    few = {"recovery_rays_per_camera": 5, "ray_sigma_deg": 0.5, "max_relative_sigma": 0.2}
     for method in ({"method": "scale_chain"}, options):
         averager(**method, **few).position(problem, 0)
-    assert told == [(len(with_rays(problem, 20).rays), 1.5 * np.radians(0.5), 0.2)] * 2
+    assert told == [(len(problem.rays), 1.5 * np.radians(0.5), 0.2)] * 2
 
 
 def test_what_the_chain_falls_back_to_has_the_options_of_recovery():
@@ -581,7 +622,7 @@ def test_cameras_at_one_scale_are_those_whose_baselines_agree():
 @pytest.mark.parametrize("reject_outliers", ["none", "mfas"])
 def test_recovery_in_parts_at_scales_of_their_own_gives_way_to_the_chain(reject_outliers, capsys):
     truth = make_problem(40, 1600, "street", 1.0, 0.3, 1.0, 0.3, seed=5)
-    problem = positioning(truth, perturb_rotations(truth.rotations, 0.2, 3))
+    problem = thinned(positioning(truth, perturb_rotations(truth.rotations, 0.2, 3)))
     recovery = averager("translation_recovery", reject_outliers=reject_outliers)
     found = recovery.position(problem, 0)
     np.testing.assert_array_equal(found, CHAIN.position(problem, 0))
@@ -590,7 +631,7 @@ def test_recovery_in_parts_at_scales_of_their_own_gives_way_to_the_chain(reject_
 
 
 def test_recovery_at_one_scale_is_kept(capsys):
-    problem = positioning(make_problem(20, 800, "area", 0.5, 0.1, 0.3, 0.1, seed=2))
+    problem = thinned(positioning(make_problem(20, 800, "area", 0.5, 0.1, 0.3, 0.1, seed=2)))
     found = averager("translation_recovery", reject_outliers="none").position(problem, 0)
     assert np.isfinite(found).all() and not np.array_equal(found, CHAIN.position(problem, 0))
     assert capsys.readouterr().out == ""
