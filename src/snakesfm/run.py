@@ -21,6 +21,7 @@ from snakesfm.records import MAKES_PART, forget, unrecorded_files, was_made_with
 from snakesfm.scene_plan import ScenePlan
 
 LOCK_NAME = ".snakesfm.lock"
+CONFIGURATION_NAME = ".snakesfm.config.json"
 MOST_SENTENCES = 10
 KILLED = "was killed from outside (out of memory, time limit, cancelled, or its node failed)"
 RELATIVE_AUC = re.compile(r"relative_pose_auc_(.+)deg")
@@ -126,10 +127,7 @@ class Run:
         try:
             self._note(f"process {os.getpid()} on {os.uname().nodename}{jobs}")
         except OSError as error:
-            raise ConfigError(
-                f"The output folder '{self.plan.output}' cannot be written ({error.strerror}): "
-                "free disk space, then run again."
-            ) from None
+            raise self._lack_of_space(error) from None
         self._bring_times_back()
         for scene in self.plan.scenes.values():
             print(
@@ -137,6 +135,40 @@ class Run:
                 f"{scene.blocks} blocks; logs in {scene.folder / 'logs'}",
                 flush=True,
             )
+
+    def keep_configuration(self, workflow: Any) -> None:
+        """Have jobs that parse the Snakefile anew read this run's configuration, not what is edited since.
+
+        Jobs on one machine parse nothing. Where nodes do not share the sources, Snakemake (9.27) has sent
+        them a copy of the files of configuration before.
+
+        Parameters
+        ----------
+        workflow : Snakemake's, before it starts jobs; the output folder is this run's.
+
+        Raises
+        ------
+        ConfigError : the folder cannot be written.
+        """
+        shared = {usage.name for usage in workflow.storage_settings.shared_fs_usage}
+        if workflow.local_exec or self.plan.weights_only or not {"SOURCES", "INPUT_OUTPUT"} <= shared:
+            return
+        # loaded here, as runs on one machine need no h5py
+        from snakesfm.artifacts import write_json
+
+        path = (self.plan.output / CONFIGURATION_NAME).absolute()
+        try:
+            write_json(path, self.plan.configuration.model_dump())
+        except OSError as error:
+            raise self._lack_of_space(error) from None
+        workflow.config_settings.configfiles = [path]
+
+    def _lack_of_space(self, error: OSError) -> ConfigError:
+        """What a run says that could lock the output folder and cannot write to it."""
+        return ConfigError(
+            f"The output folder '{self.plan.output}' cannot be written ({error.strerror}): "
+            "free disk space, then run again."
+        )
 
     def _note(self, text: str) -> None:
         """Say in the lock file who holds it."""

@@ -1,17 +1,21 @@
 """What a run sets aside and locks at its start, and what it says of its scenes in the end."""
 
+import datetime
 import json
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Set
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
+from snakemake.common.configfile import load_configfile
+from snakemake_interface_executor_plugins.settings import SharedFSUsage
 
 from snakesfm.errors import ConfigError
 from snakesfm.job_logs import describe_cost
 from snakesfm.model_files import MODEL_FILES
 from snakesfm.plan import Plan
-from snakesfm.run import LOCK_NAME, Run
+from snakesfm.run import CONFIGURATION_NAME, LOCK_NAME, Run
 
 MODEL = {"export_model", "evaluate_model"}
 SUMMARY = {"images": 9, "registered_images": 5, "points": 321, "mean_reprojection_error_px": 0.5}
@@ -86,6 +90,55 @@ def test_a_run_holds_its_folder_from_start_to_end(plan: Plan, run: Run) -> None:
     run.lock.close()
     second.start()
     second.lock.close()
+
+
+def workflow_of(local_exec: bool, shared: Set[SharedFSUsage]) -> SimpleNamespace:
+    """Snakemake's workflow as far as it matters to the configuration, which is from a file."""
+    return SimpleNamespace(
+        local_exec=local_exec,
+        storage_settings=SimpleNamespace(shared_fs_usage=shared),
+        config_settings=SimpleNamespace(configfiles=[Path("/elsewhere/mine.yaml")]),
+    )
+
+
+def test_jobs_of_a_cluster_read_the_configuration_that_the_run_keeps(plan: Plan) -> None:
+    scenes = {2024: {"images": "scene"}, True: {"images": "./scene"}}
+    config = {
+        "output": datetime.date(2024, 5, 1),
+        "scenes": scenes,
+        "adjust_bundle": {"thresholds_px": [9.0, 3]},
+        "blocks": 3,
+    }
+    run = Run(Plan(config))
+    run.start()
+    workflow = workflow_of(False, SharedFSUsage.all())
+    run.keep_configuration(workflow)
+    run.lock.close()
+    kept = Path("2024-05-01", CONFIGURATION_NAME).absolute()
+    assert workflow.config_settings.configfiles == [kept]
+    assert {file.name for file in kept.parent.iterdir()} == {LOCK_NAME, CONFIGURATION_NAME}
+    again = Plan(load_configfile(kept))
+    assert again.configuration == run.plan.configuration
+    assert sorted(again.scenes) == ["2024", "True"]
+    assert again.scenes["True"].images == run.plan.scenes["True"].images
+
+
+@pytest.mark.parametrize(
+    ("local_exec", "shared"),
+    [
+        (True, SharedFSUsage.all()),
+        (False, frozenset()),
+        (False, SharedFSUsage.all() - {SharedFSUsage.SOURCES}),
+        (False, SharedFSUsage.all() - {SharedFSUsage.INPUT_OUTPUT}),
+    ],
+)
+def test_the_files_of_configuration_stay_where_jobs_parse_or_share_none(
+    run: Run, local_exec: bool, shared: Set[SharedFSUsage]
+) -> None:
+    workflow = workflow_of(local_exec, shared)
+    run.keep_configuration(workflow)
+    assert workflow == workflow_of(local_exec, shared)
+    assert not Path("out", CONFIGURATION_NAME).exists()
 
 
 def test_failed_jobs_are_told_by_their_logs(run: Run, capsys: pytest.CaptureFixture) -> None:

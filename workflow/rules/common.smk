@@ -218,6 +218,7 @@ def start_run():
         slurm.steady(executor)
     try:
         RUN.start(slurm_run)
+        RUN.keep_configuration(workflow)
     except SnakesfmError as error:
         raise refusal(error) from None
     if workflow.local_exec and not workflow.deployment_settings.deployment_method:
