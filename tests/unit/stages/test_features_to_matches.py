@@ -29,6 +29,7 @@ from snakesfm.errors import ConfigError
 from snakesfm.geometry.camera import PARAM_SLOTS
 from snakesfm.ingest.discover import digest_images
 from snakesfm.ingest.indexed import IndexedImages
+from snakesfm.matching.matcher import MutualRatioMatcher
 from snakesfm.stages import describe_images, extract_features, learn_vocabulary, match_pairs, select_pairs
 from snakesfm.stages.job import StageJob
 
@@ -396,6 +397,21 @@ def test_matches_are_right_and_do_not_depend_on_the_blocks(whole, dealt):
     assert len(matches) > 80 and (error < 1).mean() > 0.97 and 1e-4 < np.median(error) < 0.1
     assert ((scores >= 0.2 - 1e-6) & (scores <= 1)).all()
     assert len(one[0, 4][0]) < 12 and len(one[0, 2][0]) == len(one[2, 3][0]) == 0
+
+
+def test_each_first_image_of_a_tile_is_prepared_once(whole, monkeypatch):
+    whole.select(SelectPairsOptions())
+    prepared = []
+    original = MutualRatioMatcher.prepare
+    monkeypatch.setattr(
+        MutualRatioMatcher,
+        "prepare",
+        lambda self, first: prepared.append(first.image_name) or original(self, first),
+    )
+    # fewer than a first image has partners
+    monkeypatch.setattr(match_pairs, "HELD_IMAGES", 2)
+    assert len(whole.match()) == 15
+    assert prepared == NAMES[:5]
 
 
 def test_unchanged_images_and_pairs_are_taken_over(dealt, images, tmp_path, monkeypatch, capsys):
