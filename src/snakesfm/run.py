@@ -24,6 +24,7 @@ LOCK_NAME = ".snakesfm.lock"
 CONFIGURATION_NAME = ".snakesfm.config.json"
 MOST_SENTENCES = 10
 KILLED = "was killed from outside (out of memory, time limit, cancelled, or its node failed)"
+FEWER_JOBS = "; if memory ran out, with fewer jobs at once: --cores N or --resources mem_mb=MB"
 RELATIVE_AUC = re.compile(r"relative_pose_auc_(.+)deg")
 
 
@@ -224,13 +225,16 @@ class Run:
             for warning in self._summary(scene).get("warnings", ()):
                 print(f"snakesfm: scene '{scene.name}': warning: {warning}", flush=True)
 
-    def fail(self, planned: Mapping[str, Set[str]], unfinished: Set[str]) -> None:
+    def fail(
+        self, planned: Mapping[str, Set[str]], unfinished: Set[str], on_one_machine: bool = True
+    ) -> None:
         """Per scene its model where its jobs are done, else why they are not, and what to do if that helps.
 
         Parameters
         ----------
         planned : per scene the rules of its jobs, done or not.
         unfinished : the scenes with jobs that are not done.
+        on_one_machine : no cluster runs the jobs, so only the user can give a job more memory.
         """
         if self.plan.weights_only:
             return
@@ -246,11 +250,12 @@ class Run:
             if len(sentences) > MOST_SENTENCES:
                 more = len(sentences) - MOST_SENTENCES
                 print(f"snakesfm: scene '{scene.name}' failed: {more} more jobs.", flush=True)
-            if any(KILLED in sentence for sentence in sentences) or (
-                not sentences and scene.name in unfinished
-            ):
+            killed = any(KILLED in sentence for sentence in sentences)
+            if killed or (not sentences and scene.name in unfinished):
+                advice = FEWER_JOBS if killed and on_one_machine else ""
                 print(
-                    f"snakesfm: scene '{scene.name}' is not finished: start the same command again.",
+                    f"snakesfm: scene '{scene.name}' is not finished: start the same command "
+                    f"again{advice}.",
                     flush=True,
                 )
             elif not sentences:

@@ -20,6 +20,9 @@ from snakesfm.run import CONFIGURATION_NAME, LOCK_NAME, Run
 MODEL = {"export_model", "evaluate_model"}
 SUMMARY = {"images": 9, "registered_images": 5, "points": 321, "mean_reprojection_error_px": 0.5}
 NOT_FINISHED = "snakesfm: scene 'scene' is not finished: start the same command again."
+WITH_FEWER_JOBS = (
+    NOT_FINISHED[:-1] + "; if memory ran out, with fewer jobs at once: --cores N or --resources mem_mb=MB."
+)
 METRICS = {f"relative_pose_auc_{degrees}deg": 90.0 + degrees for degrees in (1, 3, 5)}
 
 
@@ -154,13 +157,16 @@ def test_failed_jobs_are_told_by_their_logs(run: Run, capsys: pytest.CaptureFixt
     assert "scene 'scene' failed: match_pairs 0-1 was killed from outside" in killed
     log = "(log: out/scene/logs/match_pairs/1-1.log)"
     assert failed == f"snakesfm: scene 'scene' failed: It is full. {log}"
-    assert again == NOT_FINISHED
+    assert again == WITH_FEWER_JOBS
     for number in range(12):
         write(f"out/scene/logs/extract_features/{number}.log", f"error: {number}\n")
     run.fail({}, {"scene"})
     lines = capsys.readouterr().out.splitlines()
     assert len(lines) == 12
-    assert lines[-2:] == ["snakesfm: scene 'scene' failed: 4 more jobs.", NOT_FINISHED]
+    assert lines[-2:] == ["snakesfm: scene 'scene' failed: 4 more jobs.", WITH_FEWER_JOBS]
+    # a cluster gives a job that is run again more memory
+    run.fail({}, {"scene"}, on_one_machine=False)
+    assert capsys.readouterr().out.splitlines()[-1] == NOT_FINISHED
 
 
 def test_the_next_step_is_said_of_what_failed_by_no_fault_of_its_own(

@@ -235,4 +235,4 @@ def fail_run(log):
     """One line per scene that ended well, and one per error."""
     JOB_SERVER.stop()
     unfinished = rules_by_scene(workflow.dag.needrun_jobs()).keys()
-    RUN.fail(rules_by_scene(workflow.dag.jobs), unfinished)
+    RUN.fail(rules_by_scene(workflow.dag.jobs), unfinished, workflow.local_exec)
