@@ -34,6 +34,8 @@ class Run:
     def __init__(self, plan: Plan) -> None:
         self.plan = plan
         self.started = time.time()
+        # on the clock of the output folder's file system, as soon as that is known
+        self.begun = self.started
         self.lock: Any = None
         self.slurm_run = ""
         self.planned: Mapping[str, Set[str]] = {}
@@ -127,6 +129,7 @@ class Run:
         jobs = f", SLURM run {slurm_run}" if slurm_run else ""
         try:
             self._note(f"process {os.getpid()} on {os.uname().nodename}{jobs}")
+            self.begun = os.fstat(self.lock.fileno()).st_mtime
         except OSError as error:
             raise self._lack_of_space(error) from None
         self._bring_times_back()
@@ -268,7 +271,7 @@ class Run:
         """
         sentences = []
         for log in sorted((scene.folder / "logs").rglob("*.log")):
-            if log.stat().st_mtime < self.started:
+            if log.stat().st_mtime < self.begun:
                 continue
             lines = log.read_text("utf-8", errors="replace").splitlines()
             # one that is killed before its first line leaves an empty log

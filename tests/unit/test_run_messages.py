@@ -3,6 +3,7 @@
 import datetime
 import json
 import os
+import time
 from collections.abc import Iterator, Set
 from pathlib import Path
 from types import SimpleNamespace
@@ -167,6 +168,25 @@ def test_failed_jobs_are_told_by_their_logs(run: Run, capsys: pytest.CaptureFixt
     # a cluster gives a job that is run again more memory
     run.fail({}, {"scene"}, on_one_machine=False)
     assert capsys.readouterr().out.splitlines()[-1] == NOT_FINISHED
+
+
+@pytest.mark.parametrize("ahead_s", [-120.0, 120.0])
+def test_logs_of_a_run_are_told_by_the_clock_of_their_file_system(
+    plan: Plan, monkeypatch: pytest.MonkeyPatch, ahead_s: float
+) -> None:
+    former = write("out/scene/logs/match_pairs/0-0.log", "error: of the run before\n")
+    minute_ago = time.time() - 60
+    os.utime(former, (minute_ago, minute_ago))
+    # of the machine that the run is started on
+    monkeypatch.setattr("snakesfm.run.time", SimpleNamespace(time=lambda: time.time() + ahead_s))
+    run = Run(plan)
+    # which asks for nanoseconds too
+    monkeypatch.setattr(run, "_bring_times_back", lambda: None)
+    run.start()
+    write("out/scene/logs/match_pairs/0-1.log", "error: It is full.\n")
+    (sentence,) = run.failures(plan.scenes["scene"])
+    run.lock.close()
+    assert sentence.startswith("It is full.")
 
 
 def test_the_next_step_is_said_of_what_failed_by_no_fault_of_its_own(
