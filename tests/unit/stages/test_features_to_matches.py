@@ -492,6 +492,20 @@ def test_a_damaged_former_or_shared_file_costs_time_alone(images, tmp_path, caps
     assert cached.exists()
 
 
+def test_what_is_shared_already_stays_unless_it_is_damaged(tmp_path, capsys):
+    """Also of another size, as the names of scenes in the header make it."""
+    made, cached = tmp_path / "made.h5", tmp_path / "shared" / "cached.h5"
+    made.write_bytes(b"made here")
+    cached.parent.mkdir()
+    cached.write_bytes(b"made in another scene")
+    share(made, cached)
+    assert cached.read_bytes() == b"made in another scene"
+    share(made, cached, replace=True)
+    assert cached.read_bytes() == b"made here"
+    assert list(cached.parent.iterdir()) == [cached]
+    assert capsys.readouterr().out == ""
+
+
 def newer(kind, **options):
     """The options of a version to come."""
     return type("Newer", (kind,), {"stage_version": 999})(**options)
