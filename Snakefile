@@ -4,10 +4,15 @@
 
 from snakemake.utils import min_version
 
+from snakesfm.run import CONFIGURATION_NAME
+
 min_version("9.27")
 
 
-configfile: f"{workflow.basedir}/config.yaml"
+# a cluster's jobs are given all of the run's configuration in one file instead
+if not any(file.name == CONFIGURATION_NAME for file in workflow.overwrite_configfiles):
+
+    configfile: f"{workflow.basedir}/config.yaml"
 
 
 # used with --software-deployment-method apptainer alone; built from workflow/envs/Dockerfile

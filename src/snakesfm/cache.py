@@ -37,10 +37,11 @@ def share(path: Path, cached: Path, replace: bool = False) -> None:
     ----------
     path : the finished file.
     cached : its place, see :func:`cached_path`.
-    replace : whether to replace a file of the same size that is there.
+    replace : whether to replace a file that is there, as a damaged one.
     """
     try:
-        if not replace and cached.exists() and cached.stat().st_size == path.stat().st_size:
+        # its name is a digest of what it holds
+        if not replace and cached.exists():
             return
         cached.parent.mkdir(parents=True, exist_ok=True)
         temporary = cached.with_name(f".{cached.name}.{os.uname().nodename}.{os.getpid()}")

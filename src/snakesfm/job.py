@@ -207,7 +207,10 @@ def _fail(call: Call, error: Exception, terminal: Any) -> None:
         )
         _print_trace()
     elif isinstance(error, MemoryError):
-        sentence = "Not enough memory: give the job more mem_mb, or use more blocks."
+        sentence = (
+            "Not enough memory: use fewer jobs at once (--resources mem_mb=MB on one machine), give the "
+            "job more mem_mb, or use more blocks."
+        )
         _print_trace()
     elif type(error).__name__ == "OutOfMemoryError":
         sentence = "Not enough memory on the CUDA device: set batch_size=1, smaller images, or device=cpu."

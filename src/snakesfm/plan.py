@@ -35,7 +35,7 @@ class Plan:
     """
 
     def __init__(self, config: Mapping[str, Any], weights_only: bool = False) -> None:
-        configuration = load_configuration(config)
+        self.configuration = configuration = load_configuration(config)
         self.output = Path(configuration.output).expanduser()
         self.weights = Path(configuration.weights).expanduser()
         self.weights_only = weights_only

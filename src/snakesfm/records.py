@@ -103,6 +103,24 @@ def check_folder(snakefile: str, records: Path = RECORDS) -> None:
         )
 
 
+def check_backend(backend: str) -> None:
+    """Make sure that Snakemake keeps its records where they are looked for.
+
+    Parameters
+    ----------
+    backend : Snakemake's option ``--persistence-backend``.
+
+    Raises
+    ------
+    ConfigError : they are not kept in files.
+    """
+    if backend != "file":
+        raise ConfigError(
+            "snakesfm reads Snakemake's records in '.snakemake/metadata', where --persistence-backend "
+            f"{backend} keeps none: leave out this option."
+        )
+
+
 def split_words(arguments: Iterable[str]) -> set[str]:
     """The words of Snakemake's command line, with rules apart from the option that names them.
 

@@ -21,8 +21,10 @@ from snakesfm.records import MAKES_PART, forget, unrecorded_files, was_made_with
 from snakesfm.scene_plan import ScenePlan
 
 LOCK_NAME = ".snakesfm.lock"
+CONFIGURATION_NAME = ".snakesfm.config.json"
 MOST_SENTENCES = 10
 KILLED = "was killed from outside (out of memory, time limit, cancelled, or its node failed)"
+FEWER_JOBS = "; if memory ran out, with fewer jobs at once: --cores N or --resources mem_mb=MB"
 RELATIVE_AUC = re.compile(r"relative_pose_auc_(.+)deg")
 
 
@@ -32,6 +34,8 @@ class Run:
     def __init__(self, plan: Plan) -> None:
         self.plan = plan
         self.started = time.time()
+        # on the clock of the output folder's file system, as soon as that is known
+        self.begun = self.started
         self.lock: Any = None
         self.slurm_run = ""
         self.planned: Mapping[str, Set[str]] = {}
@@ -125,11 +129,9 @@ class Run:
         jobs = f", SLURM run {slurm_run}" if slurm_run else ""
         try:
             self._note(f"process {os.getpid()} on {os.uname().nodename}{jobs}")
+            self.begun = os.fstat(self.lock.fileno()).st_mtime
         except OSError as error:
-            raise ConfigError(
-                f"The output folder '{self.plan.output}' cannot be written ({error.strerror}): "
-                "free disk space, then run again."
-            ) from None
+            raise self._lack_of_space(error) from None
         self._bring_times_back()
         for scene in self.plan.scenes.values():
             print(
@@ -137,6 +139,40 @@ class Run:
                 f"{scene.blocks} blocks; logs in {scene.folder / 'logs'}",
                 flush=True,
             )
+
+    def keep_configuration(self, workflow: Any) -> None:
+        """Have jobs that parse the Snakefile anew read this run's configuration, not what is edited since.
+
+        Jobs on one machine parse nothing. Where nodes do not share the sources, Snakemake (9.27) has sent
+        them a copy of the files of configuration before.
+
+        Parameters
+        ----------
+        workflow : Snakemake's, before it starts jobs; the output folder is this run's.
+
+        Raises
+        ------
+        ConfigError : the folder cannot be written.
+        """
+        shared = {usage.name for usage in workflow.storage_settings.shared_fs_usage}
+        if workflow.local_exec or self.plan.weights_only or not {"SOURCES", "INPUT_OUTPUT"} <= shared:
+            return
+        # loaded here, as runs on one machine need no h5py
+        from snakesfm.artifacts import write_json
+
+        path = (self.plan.output / CONFIGURATION_NAME).absolute()
+        try:
+            write_json(path, self.plan.configuration.model_dump())
+        except OSError as error:
+            raise self._lack_of_space(error) from None
+        workflow.config_settings.configfiles = [path]
+
+    def _lack_of_space(self, error: OSError) -> ConfigError:
+        """What a run says that could lock the output folder and cannot write to it."""
+        return ConfigError(
+            f"The output folder '{self.plan.output}' cannot be written ({error.strerror}): "
+            "free disk space, then run again."
+        )
 
     def _note(self, text: str) -> None:
         """Say in the lock file who holds it."""
@@ -192,13 +228,16 @@ class Run:
             for warning in self._summary(scene).get("warnings", ()):
                 print(f"snakesfm: scene '{scene.name}': warning: {warning}", flush=True)
 
-    def fail(self, planned: Mapping[str, Set[str]], unfinished: Set[str]) -> None:
+    def fail(
+        self, planned: Mapping[str, Set[str]], unfinished: Set[str], on_one_machine: bool = True
+    ) -> None:
         """Per scene its model where its jobs are done, else why they are not, and what to do if that helps.
 
         Parameters
         ----------
         planned : per scene the rules of its jobs, done or not.
         unfinished : the scenes with jobs that are not done.
+        on_one_machine : no cluster runs the jobs, so only the user can give a job more memory.
         """
         if self.plan.weights_only:
             return
@@ -214,11 +253,12 @@ class Run:
             if len(sentences) > MOST_SENTENCES:
                 more = len(sentences) - MOST_SENTENCES
                 print(f"snakesfm: scene '{scene.name}' failed: {more} more jobs.", flush=True)
-            if any(KILLED in sentence for sentence in sentences) or (
-                not sentences and scene.name in unfinished
-            ):
+            killed = any(KILLED in sentence for sentence in sentences)
+            if killed or (not sentences and scene.name in unfinished):
+                advice = FEWER_JOBS if killed and on_one_machine else ""
                 print(
-                    f"snakesfm: scene '{scene.name}' is not finished: start the same command again.",
+                    f"snakesfm: scene '{scene.name}' is not finished: start the same command "
+                    f"again{advice}.",
                     flush=True,
                 )
             elif not sentences:
@@ -231,7 +271,7 @@ class Run:
         """
         sentences = []
         for log in sorted((scene.folder / "logs").rglob("*.log")):
-            if log.stat().st_mtime < self.started:
+            if log.stat().st_mtime < self.begun:
                 continue
             lines = log.read_text("utf-8", errors="replace").splitlines()
             # one that is killed before its first line leaves an empty log

@@ -1,14 +1,16 @@
-"""What a job reads from standard input."""
+"""What a job reads from standard input, and says where it fails."""
 
 import hashlib
+import io
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
-from snakesfm.job import Call
+from snakesfm.job import Call, _fail
 
 NAMES = [
     "a b.h5",
@@ -55,3 +57,17 @@ def test_a_jobs_memory_is_its_own_and_not_that_of_who_started_it() -> None:
         [sys.executable, "-c", code, report], capture_output=True, text=True, check=True
     ).stdout
     assert 5 < float(out) < 200
+
+
+def test_a_lack_of_memory_names_what_helps_on_one_machine_too(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    statuses: list[int] = []
+    monkeypatch.setattr(os, "_exit", statuses.append)
+    terminal = io.StringIO()
+    _fail(Call("match_pairs", {}, {"scene": "s"}, 1, Path("job.log")), MemoryError(), terminal)
+    assert statuses == [1]
+    (said,) = terminal.getvalue().splitlines()
+    assert said.startswith("snakesfm: scene 's', match_pairs: Not enough memory: use fewer jobs at once")
+    assert "--resources mem_mb=MB on one machine" in said and "more mem_mb" in said
+    assert capsys.readouterr().out.splitlines() == [f"error: {said.partition('match_pairs: ')[2]}"]

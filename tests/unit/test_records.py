@@ -5,10 +5,19 @@ from base64 import urlsafe_b64encode
 from pathlib import Path
 
 import pytest
+from snakemake.settings.enums import PersistenceBackend
+from snakemake.settings.types import WorkflowSettings
 from users import without_root
 
 from snakesfm.errors import ConfigError
-from snakesfm.records import check_folder, forget, makes_nothing, unrecorded_files, was_made_with
+from snakesfm.records import (
+    check_backend,
+    check_folder,
+    forget,
+    makes_nothing,
+    unrecorded_files,
+    was_made_with,
+)
 
 
 def test_a_folder_without_room_for_records_is_named(
@@ -28,6 +37,12 @@ def test_a_folder_without_room_for_records_is_named(
     records.chmod(0o555)
     with without_root(), pytest.raises(ConfigError, match=r"\.snakemake cannot be written"):
         check_folder("/opt/snakesfm/Snakefile")
+
+
+def test_records_in_a_database_are_refused_as_none_of_them_would_be_found() -> None:
+    check_backend(WorkflowSettings().persistence_backend.item_to_choice())
+    with pytest.raises(ConfigError, match=r"--persistence-backend db .*: leave out this option"):
+        check_backend(PersistenceBackend.DB.item_to_choice())
 
 
 def write_record(records: Path, output: Path, endtime: float, *params: str) -> list[str]:

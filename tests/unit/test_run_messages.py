@@ -1,21 +1,29 @@
 """What a run sets aside and locks at its start, and what it says of its scenes in the end."""
 
+import datetime
 import json
 import os
-from collections.abc import Iterator
+import time
+from collections.abc import Iterator, Set
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
+from snakemake.common.configfile import load_configfile
+from snakemake_interface_executor_plugins.settings import SharedFSUsage
 
 from snakesfm.errors import ConfigError
 from snakesfm.job_logs import describe_cost
 from snakesfm.model_files import MODEL_FILES
 from snakesfm.plan import Plan
-from snakesfm.run import LOCK_NAME, Run
+from snakesfm.run import CONFIGURATION_NAME, LOCK_NAME, Run
 
 MODEL = {"export_model", "evaluate_model"}
 SUMMARY = {"images": 9, "registered_images": 5, "points": 321, "mean_reprojection_error_px": 0.5}
 NOT_FINISHED = "snakesfm: scene 'scene' is not finished: start the same command again."
+WITH_FEWER_JOBS = (
+    NOT_FINISHED[:-1] + "; if memory ran out, with fewer jobs at once: --cores N or --resources mem_mb=MB."
+)
 METRICS = {f"relative_pose_auc_{degrees}deg": 90.0 + degrees for degrees in (1, 3, 5)}
 
 
@@ -88,6 +96,55 @@ def test_a_run_holds_its_folder_from_start_to_end(plan: Plan, run: Run) -> None:
     second.lock.close()
 
 
+def workflow_of(local_exec: bool, shared: Set[SharedFSUsage]) -> SimpleNamespace:
+    """Snakemake's workflow as far as it matters to the configuration, which is from a file."""
+    return SimpleNamespace(
+        local_exec=local_exec,
+        storage_settings=SimpleNamespace(shared_fs_usage=shared),
+        config_settings=SimpleNamespace(configfiles=[Path("/elsewhere/mine.yaml")]),
+    )
+
+
+def test_jobs_of_a_cluster_read_the_configuration_that_the_run_keeps(plan: Plan) -> None:
+    scenes = {2024: {"images": "scene"}, True: {"images": "./scene"}}
+    config = {
+        "output": datetime.date(2024, 5, 1),
+        "scenes": scenes,
+        "adjust_bundle": {"thresholds_px": [9.0, 3]},
+        "blocks": 3,
+    }
+    run = Run(Plan(config))
+    run.start()
+    workflow = workflow_of(False, SharedFSUsage.all())
+    run.keep_configuration(workflow)
+    run.lock.close()
+    kept = Path("2024-05-01", CONFIGURATION_NAME).absolute()
+    assert workflow.config_settings.configfiles == [kept]
+    assert {file.name for file in kept.parent.iterdir()} == {LOCK_NAME, CONFIGURATION_NAME}
+    again = Plan(load_configfile(kept))
+    assert again.configuration == run.plan.configuration
+    assert sorted(again.scenes) == ["2024", "True"]
+    assert again.scenes["True"].images == run.plan.scenes["True"].images
+
+
+@pytest.mark.parametrize(
+    ("local_exec", "shared"),
+    [
+        (True, SharedFSUsage.all()),
+        (False, frozenset()),
+        (False, SharedFSUsage.all() - {SharedFSUsage.SOURCES}),
+        (False, SharedFSUsage.all() - {SharedFSUsage.INPUT_OUTPUT}),
+    ],
+)
+def test_the_files_of_configuration_stay_where_jobs_parse_or_share_none(
+    run: Run, local_exec: bool, shared: Set[SharedFSUsage]
+) -> None:
+    workflow = workflow_of(local_exec, shared)
+    run.keep_configuration(workflow)
+    assert workflow == workflow_of(local_exec, shared)
+    assert not Path("out", CONFIGURATION_NAME).exists()
+
+
 def test_failed_jobs_are_told_by_their_logs(run: Run, capsys: pytest.CaptureFixture) -> None:
     former = write("out/scene/logs/match_pairs/9-9.log", "error: of the run before\n")
     os.utime(former, (1, 1))
@@ -101,13 +158,35 @@ def test_failed_jobs_are_told_by_their_logs(run: Run, capsys: pytest.CaptureFixt
     assert "scene 'scene' failed: match_pairs 0-1 was killed from outside" in killed
     log = "(log: out/scene/logs/match_pairs/1-1.log)"
     assert failed == f"snakesfm: scene 'scene' failed: It is full. {log}"
-    assert again == NOT_FINISHED
+    assert again == WITH_FEWER_JOBS
     for number in range(12):
         write(f"out/scene/logs/extract_features/{number}.log", f"error: {number}\n")
     run.fail({}, {"scene"})
     lines = capsys.readouterr().out.splitlines()
     assert len(lines) == 12
-    assert lines[-2:] == ["snakesfm: scene 'scene' failed: 4 more jobs.", NOT_FINISHED]
+    assert lines[-2:] == ["snakesfm: scene 'scene' failed: 4 more jobs.", WITH_FEWER_JOBS]
+    # a cluster gives a job that is run again more memory
+    run.fail({}, {"scene"}, on_one_machine=False)
+    assert capsys.readouterr().out.splitlines()[-1] == NOT_FINISHED
+
+
+@pytest.mark.parametrize("ahead_s", [-120.0, 120.0])
+def test_logs_of_a_run_are_told_by_the_clock_of_their_file_system(
+    plan: Plan, monkeypatch: pytest.MonkeyPatch, ahead_s: float
+) -> None:
+    former = write("out/scene/logs/match_pairs/0-0.log", "error: of the run before\n")
+    minute_ago = time.time() - 60
+    os.utime(former, (minute_ago, minute_ago))
+    # of the machine that the run is started on
+    monkeypatch.setattr("snakesfm.run.time", SimpleNamespace(time=lambda: time.time() + ahead_s))
+    run = Run(plan)
+    # which asks for nanoseconds too
+    monkeypatch.setattr(run, "_bring_times_back", lambda: None)
+    run.start()
+    write("out/scene/logs/match_pairs/0-1.log", "error: It is full.\n")
+    (sentence,) = run.failures(plan.scenes["scene"])
+    run.lock.close()
+    assert sentence.startswith("It is full.")
 
 
 def test_the_next_step_is_said_of_what_failed_by_no_fault_of_its_own(

@@ -79,6 +79,13 @@ def test_a_quiet_call_gives_its_sentence_too(workflow) -> None:
     assert outcome.text.count("convert files such as 'IMG_1.HEIC' to JPEG (1 files)") == 1
 
 
+def test_records_in_a_database_are_refused_before_the_images_are_looked_at(workflow) -> None:
+    outcome = workflow.run("--persistence-backend", "db", "--config", "output=out", "images=nowhere")
+    assert outcome.status != 0
+    assert "Traceback" not in outcome.text
+    assert "--persistence-backend db keeps none: leave out this option" in outcome.text
+
+
 def test_one_image_is_too_few(workflow, small_scene: Path) -> None:
     fill(workflow.folder / "one", photographs(small_scene, 1))
     outcome = workflow.run("--config", "images=one", "output=out")

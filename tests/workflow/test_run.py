@@ -23,6 +23,7 @@ from benchmarks.compare.measure import Cost
 from benchmarks.compare.methods import stage_costs
 from snakesfm.artifacts import LocalFeatures, Reconstruction
 from snakesfm.config.configuration import STAGES
+from snakesfm.run import CONFIGURATION_NAME
 from snakesfm.start import NO_SERVER, VARIABLE
 
 MAPPING = [
@@ -397,6 +398,22 @@ def test_the_workflow_may_lie_in_a_folder_of_any_name(root: Path, small_scene: P
     done = subprocess.run(command, cwd=workflow.folder, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert (workflow.folder / "out" / "square" / "index_images" / "index.h5").is_file()
+
+
+def test_a_job_of_a_cluster_reads_no_configuration_but_the_kept_one(root: Path, workflow) -> None:
+    shutil.copytree(root / "workflow", workflow.folder / "workflow")
+    shutil.copy(root / "Snakefile", workflow.folder)
+    # which is being edited
+    (workflow.folder / "config.yaml").write_text("match_pairs: {max_ratio:")
+    (workflow.folder / "images").mkdir()
+    for name in ("a.jpg", "b.jpg"):
+        (workflow.folder / "images" / name).write_text(name)
+    (workflow.folder / CONFIGURATION_NAME).write_text('{"images": "images", "output": "out", "blocks": 1}')
+    command = workflow.command("--dry-run", "--configfile", CONFIGURATION_NAME)
+    command[command.index("--snakefile") + 1] = str(workflow.folder / "Snakefile")
+    done = subprocess.run(command, cwd=workflow.folder, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "rule adjust_bundle" in done.stdout
 
 
 def test_the_output_may_be_the_folder_one_is_in(small_scene: Path, workflow) -> None:

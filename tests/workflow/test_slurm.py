@@ -200,6 +200,30 @@ def test_a_controller_that_is_ended_leaves_nothing_that_hinders_the_next(
     assert not list(output.rglob("*.tmp"))
 
 
+def test_what_is_edited_while_a_run_goes_on_is_for_the_next(
+    finished, small_scene: Path, cluster: Cluster, on_slurm: Workflow
+) -> None:
+    copy_run(finished[0], on_slurm.folder)
+    output = on_slurm.folder / "out" / "square"
+    (output / "adjust_bundle" / "reconstruction.h5").unlink()
+    shutil.rmtree(output / "logs" / "adjust_bundle")
+    file = on_slurm.folder / "mine.yaml"
+    file.write_text("export_model: {all_keypoints: false}\n")
+    arguments = [*QUICK, "--configfile", "mine.yaml", *config_of(small_scene)]
+    run = on_slurm.start(*arguments)
+    # the model is exported by a SLURM job that starts later
+    pid, _ = wait_for_process(output / "logs" / "adjust_bundle" / "job.log", run)
+    os.kill(pid, signal.SIGSTOP)
+    file.write_text("export_model: {all_keypoints: true}\n")
+    os.kill(pid, signal.SIGCONT)
+    text, _ = run.communicate(timeout=300)
+    assert run.returncode == 0, text
+    assert model_bytes(output) == model_bytes(finished[0])
+    last = on_slurm.run(*arguments)
+    assert last.status == 0, last.text
+    assert model_bytes(output) != model_bytes(finished[0])
+
+
 @pytest.mark.parametrize("forgets", [False, True])
 def test_a_run_goes_on_when_slurm_is_back(
     finished, small_scene: Path, cluster: Cluster, on_slurm: Workflow, forgets: bool

@@ -16,7 +16,7 @@ from snakesfm.config_checks import check_given_once, check_keys
 from snakesfm.job_server import JobServer
 from snakesfm.model_files import MODEL_FILES
 from snakesfm.plan import Plan
-from snakesfm.records import check_folder, makes_nothing, split_words
+from snakesfm.records import check_backend, check_folder, makes_nothing, split_words
 from snakesfm.rule_settings import check_named_together, share_resources
 from snakesfm.run import Run
 from snakesfm.scene_checks import check_results
@@ -37,6 +37,7 @@ try:
     asked = {word.split(":")[0] for word in words}
     if workflow.is_main_process:
         check_folder(workflow.main_snakefile)
+        check_backend(workflow.workflow_settings.persistence_backend.item_to_choice())
         check_given_once(sys.argv[1:])
         check_keys(workflow.overwrite_configfiles)
     check_spelling(config, sys.argv[1:])
@@ -224,6 +225,7 @@ def start_run():
         slurm.steady(executor)
     try:
         RUN.start(slurm_run)
+        RUN.keep_configuration(workflow)
     except SnakesfmError as error:
         raise refusal(error) from None
     if workflow.local_exec and not workflow.deployment_settings.deployment_method:
@@ -240,4 +242,4 @@ def fail_run(log):
     """One line per scene that ended well, and one per error."""
     JOB_SERVER.stop()
     unfinished = rules_by_scene(workflow.dag.needrun_jobs()).keys()
-    RUN.fail(rules_by_scene(workflow.dag.jobs), unfinished)
+    RUN.fail(rules_by_scene(workflow.dag.jobs), unfinished, workflow.local_exec)

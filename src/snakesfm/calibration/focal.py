@@ -158,7 +158,9 @@ def _adjust(
     start = vote_focals(pairs, prior, free, low, high)
     if len(prior) > 1:
         start = adjust_condensed(condensed, start, free, prior, weak)
-    start = scan_focals(condensed, np.clip(start, low, high), free, low, high)
+    # focal lengths that are given stay, however short or long
+    start = np.where(free, np.clip(start, low, high), start)
+    start = scan_focals(condensed, start, free, low, high)
     start = adjust_condensed(condensed, start, free, prior, weak)
     return adjust_focals(pairs, start, free, prior, weak, each)
 

@@ -39,15 +39,18 @@ Matches = tuple[Array, Array]
 
 REUSES_FORMER = True
 COLUMNS = ("keypoints", "descriptors", "scores", "scales", "angles")
-# descriptors of so many images take 20 MB at 5,000 keypoints
+# descriptors of so many second images take 20 MB at 5,000 keypoints
 HELD_IMAGES = 32
+# reading a picture takes longer than descriptors; so many take 140 MB at 840 x 632 pixels
+HELD_PICTURES = 256
 
 
 def run(job: StageJob) -> None:
     """Match pair after pair, taking over pairs whose images and options are unchanged.
 
     Writes PairMatches, or PairCoordinates where there are no keypoints. The features (or the pictures) of
-    ``HELD_IMAGES`` images and of a network's batch are held at a time, whatever the size of the blocks.
+    ``HELD_IMAGES`` (``HELD_PICTURES``) images and of a network's batch are held at a time, whatever the
+    size of the blocks.
 
     Raises
     ------
@@ -70,10 +73,13 @@ def run(job: StageJob) -> None:
         results = {row: former[digest] for row, digest in enumerate(digests) if digest in former}
         reused = len(results)
         progress = job.progress(len(pairs) - reused, "pairs")
-        read_second = functools.lru_cache(HELD_IMAGES)(lambda j: matcher.prepare_second(source.read(j)))
+        read_second = functools.lru_cache(HELD_PICTURES if free else HELD_IMAGES)(
+            lambda j: matcher.prepare_second(source.read(j))
+        )
         held, first = -1, None
-        missing = np.array([row for row in range(len(pairs)) if row not in results], int)
-        for rows in cut(_order(pairs, missing), job.network_batch()):
+        # pairs are sorted, so that each first image is prepared once
+        missing = [row for row in range(len(pairs)) if row not in results]
+        for rows in cut(missing, job.network_batch()):
             prepared = []
             for i, j in pairs[rows].tolist():
                 if i != held:
@@ -154,13 +160,6 @@ class ImportedMatches:
         """See :class:`snakesfm.matching.matcher.Matcher`."""
         names, counts = (first[0], second[0]), (first[1], second[1])
         return read_hloc_matches(self._file, names, counts) or no_matches()
-
-
-def _order(pairs: Array, rows: Array) -> list[int]:
-    """The rows in an order in which ``HELD_IMAGES`` second images meet all their first ones."""
-    group = np.unique(pairs[rows, 1], return_inverse=True)[1] // HELD_IMAGES
-    ordered: list[int] = rows[np.lexsort((pairs[rows, 1], pairs[rows, 0], group))].tolist()
-    return ordered
 
 
 class FeatureFiles:

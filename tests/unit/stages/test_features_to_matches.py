@@ -29,6 +29,7 @@ from snakesfm.errors import ConfigError
 from snakesfm.geometry.camera import PARAM_SLOTS
 from snakesfm.ingest.discover import digest_images
 from snakesfm.ingest.indexed import IndexedImages
+from snakesfm.matching.matcher import MutualRatioMatcher
 from snakesfm.stages import describe_images, extract_features, learn_vocabulary, match_pairs, select_pairs
 from snakesfm.stages.job import StageJob
 
@@ -398,6 +399,21 @@ def test_matches_are_right_and_do_not_depend_on_the_blocks(whole, dealt):
     assert len(one[0, 4][0]) < 12 and len(one[0, 2][0]) == len(one[2, 3][0]) == 0
 
 
+def test_each_first_image_of_a_tile_is_prepared_once(whole, monkeypatch):
+    whole.select(SelectPairsOptions())
+    prepared = []
+    original = MutualRatioMatcher.prepare
+    monkeypatch.setattr(
+        MutualRatioMatcher,
+        "prepare",
+        lambda self, first: prepared.append(first.image_name) or original(self, first),
+    )
+    # fewer than a first image has partners
+    monkeypatch.setattr(match_pairs, "HELD_IMAGES", 2)
+    assert len(whole.match()) == 15
+    assert prepared == NAMES[:5]
+
+
 def test_unchanged_images_and_pairs_are_taken_over(dealt, images, tmp_path, monkeypatch, capsys):
     dealt.select(SelectPairsOptions())
     before = dealt.match()
@@ -474,6 +490,20 @@ def test_a_damaged_former_or_shared_file_costs_time_alone(images, tmp_path, caps
     extract_features.run(scene.job("extract_features", options, inputs, [made], None, **settings))
     assert "6 images (6 taken over)" in capsys.readouterr().out
     assert cached.exists()
+
+
+def test_what_is_shared_already_stays_unless_it_is_damaged(tmp_path, capsys):
+    """Also of another size, as the names of scenes in the header make it."""
+    made, cached = tmp_path / "made.h5", tmp_path / "shared" / "cached.h5"
+    made.write_bytes(b"made here")
+    cached.parent.mkdir()
+    cached.write_bytes(b"made in another scene")
+    share(made, cached)
+    assert cached.read_bytes() == b"made in another scene"
+    share(made, cached, replace=True)
+    assert cached.read_bytes() == b"made here"
+    assert list(cached.parent.iterdir()) == [cached]
+    assert capsys.readouterr().out == ""
 
 
 def newer(kind, **options):
