@@ -7,7 +7,8 @@ import numpy as np
 
 from snakesfm.arrays import Array
 from snakesfm.bundle.interface import BundleAdjuster, SolverSettings
-from snakesfm.bundle.reading import points_in_cameras, read_tracks_and_pixels
+from snakesfm.bundle.reading import Tracks, points_in_cameras, read_tracks_and_pixels
+from snakesfm.bundle.selection import with_points
 from snakesfm.geometry.colmap_binding import pycolmap
 from snakesfm.geometry.lens_fit import MIN_IMAGES
 from snakesfm.grouping import rows_of_each
@@ -75,7 +76,8 @@ def find_told_cameras(
         return ToldCameras({}, {})
     held = frozenset(reconstruction.cameras) - candidates
     free = replace(solving, constant_cameras=held, refine_principal_points=True)
-    halves = [_adjusted_half(reconstruction, half, adjust, free) for half in (0, 1)]
+    dealt = read_tracks_and_pixels(reconstruction)
+    halves = [_adjusted_half(reconstruction, *dealt, half, adjust, free) for half in (0, 1)]
     steady = {}
     for camera_id in sorted(candidates):
         camera = reconstruction.camera(camera_id)
@@ -88,7 +90,7 @@ def find_told_cameras(
             steady[camera_id] = offset / longer
     if not steady:
         return ToldCameras({}, {})
-    fixed = _adjusted_half(reconstruction, 0, adjust, replace(free, refine_principal_points=False))
+    fixed = _adjusted_half(reconstruction, *dealt, 0, adjust, replace(free, refine_principal_points=False))
     before, after = _median_errors(fixed), _median_errors(halves[0])
     told, refused = {}, {}
     for camera_id, offset in steady.items():
@@ -114,15 +116,17 @@ def shared_cameras(reconstruction: pycolmap.Reconstruction, held: frozenset[int]
 
 
 def _adjusted_half(
-    reconstruction: pycolmap.Reconstruction, half: int, adjust: BundleAdjuster, solving: SolverSettings
+    reconstruction: pycolmap.Reconstruction,
+    tracks: Tracks,
+    pixels: Array,
+    half: int,
+    adjust: BundleAdjuster,
+    solving: SolverSettings,
 ) -> pycolmap.Reconstruction:
     """A copy of the model of one half of the points, adjusted."""
-    model = pycolmap.Reconstruction(reconstruction)
-    points = sorted(model.point3D_ids())
-    kept = set(points[half :: max(2, len(points) // POINTS_PER_HALF)])
-    for point in points:
-        if point not in kept:
-            model.delete_point3D(point)
+    chosen = np.zeros(len(tracks.points), dtype=bool)
+    chosen[half :: max(2, len(chosen) // POINTS_PER_HALF)] = True
+    model = with_points(reconstruction, tracks, pixels, chosen)
     adjust(model, replace(solving, function_tolerance=solving.function_tolerance * COARSE))
     return model
 

@@ -7,11 +7,11 @@ import numpy as np
 from snakesfm.arrays import Array
 from snakesfm.bundle.interface import BundleAdjuster, SolverSettings
 from snakesfm.bundle.model import BundleModel, to_reconstruction
-from snakesfm.bundle.reading import read_tracks, read_tracks_and_pixels
+from snakesfm.bundle.reading import Tracks, read_tracks, read_tracks_and_pixels
 from snakesfm.geometry.camera import Camera
 from snakesfm.geometry.colmap_binding import pycolmap
 from snakesfm.geometry.colmap_writing import keypoints_of_observations
-from snakesfm.grouping import rows_of_each
+from snakesfm.grouping import offsets_of, rows_of_each
 
 STEPS = 5
 OBSERVATIONS_AT_ONCE = 500_000
@@ -67,16 +67,16 @@ def adjust_selection(
     The robust cost of the chosen points before and after, px^2.
     """
     tracks, pixels = read_tracks_and_pixels(reconstruction)
-    ids, points, point_rows, images = tracks.ids, tracks.points, tracks.point_rows, tracks.images
+    ids, points = tracks.ids, tracks.points
     if not len(points):
         return 0.0, 0.0
-    chosen = select_points(point_rows, images, len(points), per_image, seed)
-    mine = chosen[point_rows]
-    small = _part(reconstruction, points[chosen], point_rows[mine], images[mine], pixels[mine])
-    followers, owners = np.unique(point_rows[~mine], return_inverse=True)
-    images, pixels = images[~mine].astype(np.int32), pixels[~mine]
+    chosen = select_points(tracks.point_rows, tracks.images, len(points), per_image, seed)
+    small = with_points(reconstruction, tracks, pixels, chosen)
+    others = ~chosen[tracks.point_rows]
+    followers, owners = np.unique(tracks.point_rows[others], return_inverse=True)
+    images, pixels = tracks.images[others].astype(np.int32), pixels[others]
     # the solver needs the memory
-    del tracks, point_rows, mine
+    del tracks, others
     costs = adjust(small, solving)
     points[chosen] = read_tracks(small).points
     for camera_id, camera in small.cameras.items():
@@ -91,10 +91,19 @@ def adjust_selection(
     return costs
 
 
-def _part(
-    reconstruction: pycolmap.Reconstruction, points: Array, point_rows: Array, images: Array, pixels: Array
+def with_points(
+    reconstruction: pycolmap.Reconstruction, tracks: Tracks, pixels: Array, chosen: Array
 ) -> pycolmap.Reconstruction:
-    """The cameras and poses with these points alone, and only the keypoints that observe them."""
+    """The cameras and poses with some of the points, and only the keypoints that observe them.
+
+    Parameters
+    ----------
+    reconstruction : gives the cameras and poses.
+    tracks, pixels : its observations, see :func:`read_tracks_and_pixels`.
+    chosen : (T,) bool, the points.
+    """
+    mine = chosen[tracks.point_rows]
+    images = tracks.images[mine]
     count = max(reconstruction.images)
     camera_ids = np.zeros(count, dtype=np.int64)
     rotations, translations = np.full((count, 3, 3), np.nan), np.full((count, 3), np.nan)
@@ -105,15 +114,15 @@ def _part(
             rotations[image_id - 1], translations[image_id - 1] = pose.rotation.matrix(), pose.translation
     camera_count = max(reconstruction.cameras)
     cameras = [Camera.of_pycolmap(reconstruction.camera(row + 1)) for row in range(camera_count)]
-    keypoints, keypoint_ids = keypoints_of_observations(images, pixels, count)
-    rows = np.unique(point_rows, return_inverse=True)[1]
+    keypoints, keypoint_ids = keypoints_of_observations(images, pixels[mine], count)
+    lengths = np.bincount(tracks.point_rows, minlength=len(chosen))[chosen]
     model = BundleModel(
         tuple(cameras),
         camera_ids,
         rotations,
         translations,
-        points,
-        np.searchsorted(rows, np.arange(len(points) + 1)),
+        tracks.points[chosen],
+        offsets_of(lengths),
         images,
         keypoint_ids,
     )
