@@ -1,7 +1,9 @@
 """Fixtures shared by all tests."""
 
+import importlib
 import importlib.metadata
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 from workflow_runner import Outcome, Workflow
@@ -59,6 +61,15 @@ def finished(small_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> tup
     outcome = Workflow(folder).run("--config", *config)
     assert outcome.status == 0, outcome.text
     return folder / "out" / "square", outcome
+
+
+@pytest.fixture(scope="session")
+def open3d() -> ModuleType:
+    """The package that surfaces need; tests of them are skipped where it cannot be loaded."""
+    try:
+        return importlib.import_module("open3d")
+    except (ImportError, Warning):
+        pytest.skip("the extra 'surface' is not installed, or libraries that open3d needs are missing")
 
 
 @pytest.fixture(scope="session")

@@ -93,6 +93,12 @@ class Workflow:
             process.wait(60)
 
 
+def config_of(scene: Path, *options: str, output: str = "out") -> list[str]:
+    """The arguments of a run on a scene with a reference, and on options beside these."""
+    folders = (f"images={scene / 'images'}", f"reference={scene / 'reference'}", f"output={output}")
+    return ["--config", *folders, *options]
+
+
 def copy_run(output: Path, folder: Path) -> None:
     """Copy a finished run, with Snakemake's records, so that a test may disturb it."""
     shutil.copytree(output.parent, folder / "out", symlinks=True)

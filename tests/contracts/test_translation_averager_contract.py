@@ -1,5 +1,7 @@
 """What every translation averager must do; each implementation inherits the suite."""
 
+from typing import ClassVar
+
 import numpy as np
 import pytest
 
@@ -39,15 +41,17 @@ def center_errors(estimated, truth):
     return np.linalg.norm(scale * a + shift - b, axis=1)
 
 
-def with_options(method, **options):
-    """An averager with the options' defaults and changes."""
-    return translation_averager(AverageTranslationsOptions(method=method, **options))
-
-
 class TranslationAveragerContract:
-    averager = None
+    """Inherit and set ``method``, and ``options`` where they are not the defaults."""
+
+    method = ""
+    options: ClassVar[dict[str, str]] = {}
     exact_tolerance = 1e-3
     same_tolerance = 0.0
+
+    @property
+    def averager(self):
+        return translation_averager(AverageTranslationsOptions(method=self.method, **self.options))
 
     @pytest.mark.parametrize("layout", ["ring", "area", "facade"])
     def test_exact_directions_give_exact_centers(self, layout):
@@ -82,28 +86,31 @@ class TranslationAveragerContract:
 
 
 class TestScaleChain(TranslationAveragerContract):
-    averager = with_options("scale_chain")
+    method = "scale_chain"
 
 
 class TestTranslationRecovery(TranslationAveragerContract):
-    averager = with_options("translation_recovery")
+    method = "translation_recovery"
 
 
 class TestTranslationRecoveryMfas(TranslationAveragerContract):
-    averager = with_options("translation_recovery", reject_outliers="mfas")
+    method = "translation_recovery"
+    options: ClassVar = {"reject_outliers": "mfas"}
 
 
 class TestTranslationRecoveryNone(TranslationAveragerContract):
-    averager = with_options("translation_recovery", reject_outliers="none")
+    method = "translation_recovery"
+    options: ClassVar = {"reject_outliers": "none"}
 
 
 class TestGlobalPositioning(TranslationAveragerContract):
-    averager = with_options("global_positioning")
+    method = "global_positioning"
     exact_tolerance = 2e-2
     same_tolerance = 1e-6
 
 
 class TestGlobalPositioningFromChain(TranslationAveragerContract):
-    averager = with_options("global_positioning", positioning_start="chain")
+    method = "global_positioning"
+    options: ClassVar = {"positioning_start": "chain"}
     exact_tolerance = 2e-2
     same_tolerance = 1e-6

@@ -10,18 +10,9 @@ from pathlib import Path
 
 import h5py
 import pytest
-from workflow_runner import Workflow, copy_run, model_bytes
+from workflow_runner import Workflow, config_of, copy_run, model_bytes
 
 pytestmark = pytest.mark.workflow
-
-
-def config_of(scene: Path, output: str = "out") -> list[str]:
-    return [
-        "--config",
-        f"images={scene / 'images'}",
-        f"reference={scene / 'reference'}",
-        f"output={output}",
-    ]
 
 
 def half_written(output: Path) -> list[Path]:
@@ -180,7 +171,7 @@ def test_runs_share_features_and_matches_by_their_digests(small_scene: Path, wor
         workflow.folder, environment={**os.environ, "SNAKESFM_CACHE": str(workflow.folder / "shared")}
     )
     until = ["--until", "match_pairs"]
-    first = shared.run(*until, *config_of(small_scene, "first"))
+    first = shared.run(*until, *config_of(small_scene, output="first"))
     assert first.status == 0, first.text
     assert all(
         taken == 0 < count for count, taken in taken_over(workflow.folder / "first" / "square").values()
@@ -193,7 +184,7 @@ def test_runs_share_features_and_matches_by_their_digests(small_scene: Path, wor
     damaged.unlink()
     damaged.write_bytes(b"damaged".ljust(size))
     second = shared.run(
-        *until, *config_of(small_scene, "second"), "scene=other", "average_rotations={passes: 3}"
+        *until, *config_of(small_scene, output="second"), "scene=other", "average_rotations={passes: 3}"
     )
     assert second.status == 0, second.text
     with h5py.File(damaged) as repaired:
@@ -212,7 +203,9 @@ def test_runs_share_features_and_matches_by_their_digests(small_scene: Path, wor
                 assert all((one[name][()] == two[name][()]).all() for name in one)
     made = workflow.folder / "second" / "other" / "match_pairs"
     assert damaged.read_bytes() in [file.read_bytes() for file in made.glob("*.h5")]
-    other = shared.run(*until, *config_of(small_scene, "third"), "extract_features={max_keypoints: 400}")
+    other = shared.run(
+        *until, *config_of(small_scene, output="third"), "extract_features={max_keypoints: 400}"
+    )
     assert other.status == 0, other.text
     assert all(taken == 0 for _, taken in taken_over(workflow.folder / "third" / "square").values())
 

@@ -9,7 +9,7 @@ import time
 from pathlib import Path
 
 import pytest
-from workflow_runner import Workflow, copy_run, model_bytes
+from workflow_runner import Workflow, config_of, copy_run, model_bytes
 
 from snakesfm.plan import Plan
 from snakesfm.run import Run
@@ -33,11 +33,6 @@ def finish_and_terminate(scheduler):
 JobScheduler._finish_jobs = finish_and_terminate
 main()
 """
-
-
-def config_of(scene: Path, *options: str) -> list[str]:
-    folders = (f"images={scene / 'images'}", f"reference={scene / 'reference'}", "output=out")
-    return ["--config", *folders, *options]
 
 
 def test_a_controller_that_gets_term_while_it_deals_with_ended_jobs_ends(

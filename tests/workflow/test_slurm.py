@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 from slurm_cluster import Cluster, missing_programs, wait_for
-from workflow_runner import Workflow, copy_run, model_bytes
+from workflow_runner import Workflow, config_of, copy_run, model_bytes
 
 # polls as often as a test wants; everything else is the profile's
 QUICK = ("--seconds-between-status-checks", "1", "--max-status-checks-per-second", "2")
@@ -45,10 +45,6 @@ def cluster() -> Iterator[Cluster]:
 @pytest.fixture
 def on_slurm(cluster: Cluster, tmp_path: Path) -> Workflow:
     return Workflow(tmp_path, "slurm", cluster.environment)
-
-
-def config_of(scene: Path) -> list[str]:
-    return ["--config", f"images={scene / 'images'}", f"reference={scene / 'reference'}", "output=out"]
 
 
 def process_of(log: Path) -> tuple[int, str] | None:

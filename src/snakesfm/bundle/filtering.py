@@ -57,7 +57,15 @@ def drop_short_tracks(
 
 
 def deregister_weak_images(reconstruction: pycolmap.Reconstruction, min_observations: int) -> None:
-    """Take out images with fewer observations, the weakest first."""
+    """Take out images that observe too few points, the weakest first.
+
+    A point that is left with one observation goes with the image, which may make another image weak.
+
+    Parameters
+    ----------
+    reconstruction : changed in place.
+    min_observations : points that an image must observe.
+    """
     counts = {i: reconstruction.image(i).num_points3D for i in reconstruction.reg_image_ids()}
     heap = [(count, image_id) for image_id, count in counts.items()]
     heapq.heapify(heap)

@@ -202,7 +202,17 @@ def _capped(h: Array, b: Array) -> tuple[Array, Array, Array]:
 
 
 def correspondences_of(pair: EpipolarPair, focal_i: float, focal_j: float) -> Correspondences:
-    """The pair's points as rays, for these focal lengths."""
+    """The pair's points as rays.
+
+    Parameters
+    ----------
+    pair : its M points are pixels from each principal point.
+    focal_i, focal_j : focal lengths in pixels.
+
+    Returns
+    -------
+    M correspondences on the plane z = 1 of each camera's frame.
+    """
     one = np.ones(len(pair.points_i))
     return Correspondences(
         np.column_stack([pair.points_i / focal_i, one]),
@@ -213,7 +223,19 @@ def correspondences_of(pair: EpipolarPair, focal_i: float, focal_j: float) -> Co
 
 
 def pose_of(pair: EpipolarPair, focals: Array) -> tuple[Array, Array]:
-    """The relative pose of the essential matrix nearest to F with these focal lengths."""
+    """The relative pose of the essential matrix nearest to F with some focal lengths.
+
+    Of its four poses, the one that has most of the points in front of both cameras.
+
+    Parameters
+    ----------
+    pair : with the fundamental matrix.
+    focals : (C,) focal lengths of all cameras in pixels.
+
+    Returns
+    -------
+    Rotation (3,3) and unit translation (3,), j_from_i.
+    """
     focal_i, focal_j = float(focals[pair.camera_i]), float(focals[pair.camera_j])
     E = np.diag([focal_j, focal_j, 1.0]) @ pair.F @ np.diag([focal_i, focal_i, 1.0])
     some = slice(None, None, max(1, -(-len(pair.points_i) // POINTS_IN_FRONT)))
@@ -224,7 +246,20 @@ def pose_of(pair: EpipolarPair, focals: Array) -> tuple[Array, Array]:
 
 
 def refined_pose(pair: EpipolarPair, pose: tuple[Array, Array], focals: Array) -> tuple[Array, Array]:
-    """The best relative pose for these focal lengths, from a nearby one."""
+    """The best relative pose for some focal lengths, from a nearby one.
+
+    That of least Cauchy loss of the Sampson error, with a scale of one pixel of the mean focal length.
+
+    Parameters
+    ----------
+    pair : whose points the pose fits.
+    pose : rotation (3,3) and unit translation (3,), j_from_i, to start from.
+    focals : (C,) focal lengths of all cameras in pixels.
+
+    Returns
+    -------
+    Rotation (3,3) and unit translation (3,), j_from_i.
+    """
     focal_i, focal_j = float(focals[pair.camera_i]), float(focals[pair.camera_j])
     mean = 0.5 * (focal_i + focal_j)
     points_i, points_j = pair.points_i * (mean / focal_i), pair.points_j * (mean / focal_j)

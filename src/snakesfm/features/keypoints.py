@@ -47,7 +47,13 @@ class KeypointSet:
         )
 
     def unmasked(self, mask: Array, width: float, height: float) -> "KeypointSet":
-        """The keypoints, in an image of a width and height, that lie where a mask (H,W) is true."""
+        """The keypoints that lie where a mask is true.
+
+        Parameters
+        ----------
+        mask : (H,W) bool over the whole image, of any size.
+        width, height : size of the image in the pixels of the keypoints.
+        """
         rows, columns = mask.shape
         return self.take(pixels_at(mask, self.keypoints * np.array([columns / width, rows / height])))
 

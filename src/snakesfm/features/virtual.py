@@ -18,7 +18,8 @@ class VirtualKeypoints:
 
     A point is seen by the images that the model says observe it. The descriptor of a keypoint is the number
     of its point, so the matcher ``virtual`` pairs equal ones. What a back-end makes of these shows its own
-    errors alone (Li et al. 2026, "Distributed Global Structure-from-Motion with a Deep Front-End").
+    errors alone (Baid et al. 2023, "Distributed Global Structure-from-Motion with a Deep Front-End", arXiv
+    2311.18801).
 
     With ``surface_points`` the points lie evenly on a surface through the model's points instead, and an
     image sees those that the surface does not hide; with ``view_points`` they are spread over each image's

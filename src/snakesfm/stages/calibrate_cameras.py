@@ -39,6 +39,10 @@ def run(job: StageJob) -> None:
     """Estimate the focal lengths that are not given, and find what all images show at one place.
 
     Cameras that are given pass unchanged.
+
+    Raises
+    ------
+    ArtifactError : an image whose matches are read is in no features file.
     """
     options: CalibrateCamerasOptions = job.options
     index = ImageIndex.read(job.path("index"))

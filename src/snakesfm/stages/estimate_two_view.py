@@ -35,7 +35,12 @@ REUSES_FORMER = True
 
 
 def run(job: StageJob) -> None:
-    """Estimate every pair of the tile whose inputs have changed, and write all of them."""
+    """Estimate every pair of the tile whose inputs have changed, and write all of them.
+
+    Raises
+    ------
+    ArtifactError : an image of a pair is in no features file.
+    """
     options: EstimateTwoViewOptions = job.options
     index = ImageIndex.read(job.path("index"))
     cameras = CalibratedCameras.read(job.path("cameras"))

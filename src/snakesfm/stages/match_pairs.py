@@ -142,6 +142,8 @@ def _create_detector_free(job: StageJob, options: "MatchPairsOptions") -> Detect
 class ImportedMatches:
     """The matches of a file that hloc wrote, as a matcher; a pair that it lacks has none.
 
+    They are one to one, with scores in 0 .. 1, where those of the file are.
+
     Parameters
     ----------
     path : hloc's file of matches.

@@ -61,6 +61,9 @@ def build_tracks(
     Returns
     -------
     Tracks sorted by their first observation.
+
+    Source: Moulon and Monasse, Unordered feature tracking made fast and easy, CVMP 2012, where components
+    in conflict are dropped; parts, splitting and the exception for sparse images are this project's own.
     """
     base = offsets_of([len(k) for k in keypoints])
     counts = np.diff(offsets)

@@ -48,6 +48,22 @@ def refine_angles(
     Images without a first guess stay NaN and their rays and edges are not used. The gauge is left to the
     damping: the result is in the frame and near the scale of the first guess. A landmark of very many rays
     is cut into several, each seen from all over, which share its first guess; the first one is returned.
+
+    Parameters
+    ----------
+    problem : edges and rays in the frame of the rotations.
+    centers : (N,3) first guess, NaN where there is none.
+    scale_rad : scale of the Cauchy loss of a ray, and the least one of an edge, whose own is its standard
+        deviation; both begin eight times as large.
+    edge_weight : weight of an edge relative to a ray.
+    rounds : most steps.
+
+    Returns
+    -------
+    Centres (N,3), and landmarks (max track + 1, 3), NaN where a track has no ray that is used.
+
+    Source: Triggs et al., Bundle adjustment: a modern synthesis, section 6.1, for the elimination; the
+    chord as residual is that of 1DSfM (Wilson and Snavely, ECCV 2014).
     """
     known = np.isfinite(centers[:, 0])
     problem = problem.select_edges(known[problem.pairs[:, 0]] & known[problem.pairs[:, 1]]).select_rays(

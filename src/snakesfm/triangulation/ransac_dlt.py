@@ -15,9 +15,12 @@ def triangulate_ransac_dlt(
 ) -> tuple[Array, Array]:
     """Midpoints of pairs of rays, scored on all observations; then DLT and Gauss-Newton over the inliers.
 
-    The scheme of the GTSfM paper ("Distributed Global Structure-from-Motion with a Deep Front-End"), with a
-    truncated squared error (MSAC) as score. All pairs are tried where there are no more than
-    ``max_hypotheses``, else a seeded choice that depends on the length of the track alone.
+    The scheme of GTSfM, with a truncated squared error (MSAC) as score. All pairs are tried where there are
+    no more than ``max_hypotheses``, else a seeded choice that depends on the length of the track alone.
+
+    Source: Baid et al., Distributed Global Structure-from-Motion with a Deep Front-End, arXiv 2311.18801;
+    DLT in Hartley and Zisserman, Multiple View Geometry, section 12.2; MSAC in Torr and Zisserman, MLESAC,
+    CVIU 2000.
     """
     lengths = np.diff(problem.offsets)
     points = np.full((len(lengths), 3), np.nan)

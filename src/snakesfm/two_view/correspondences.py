@@ -36,7 +36,18 @@ def unify_matches(places_i: Array, places_j: Array, matches: Array) -> Array:
 def correspond(
     keypoints_i: Array, keypoints_j: Array, matches: Array, camera_i: Camera, camera_j: Camera
 ) -> Correspondences:
-    """Undistorted rays of the matched keypoints."""
+    """Undistorted rays of the matched keypoints.
+
+    Parameters
+    ----------
+    keypoints_i, keypoints_j : (N,2) all keypoints of each image, in the pixels of its camera.
+    matches : (M,2) int, keypoint rows in image i and in image j.
+    camera_i, camera_j : intrinsics of the two images.
+
+    Returns
+    -------
+    M correspondences in the order of the matches; a ray is NaN where its pixel has none.
+    """
     return Correspondences(
         _rays(camera_i, keypoints_i[matches[:, 0]]),
         _rays(camera_j, keypoints_j[matches[:, 1]]),
@@ -51,7 +62,18 @@ def _rays(camera: Camera, keypoints: Array) -> Array:
 
 
 def unique_matches(matches: Array, errors: Array, selected: Array) -> Array:
-    """Rows of the selected (M,) bool matches (M,2), each keypoint at most once, smallest error first."""
+    """Rows of the selected (M,) bool matches (M,2), each keypoint at most once.
+
+    Parameters
+    ----------
+    matches : (M,2) int, keypoint rows in image i and in image j.
+    errors : (M,) in any unit; of two matches at one keypoint the one whose error is nearer to zero stays.
+    selected : (M,) bool.
+
+    Returns
+    -------
+    (K,) int64, ascending.
+    """
     rows = np.nonzero(selected)[0]
     ordered = rows[np.argsort(np.abs(errors[rows]), kind="stable")]
     return np.sort(ordered[one_to_one(matches[ordered])])

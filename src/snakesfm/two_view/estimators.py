@@ -32,7 +32,16 @@ class PoseEstimator(Protocol):
     def __call__(
         self, points: Correspondences, max_error_px: float, max_iterations: int, seed: int
     ) -> RobustPose | None:
-        """The pose with the most support, or None where there is none."""
+        """The pose with the most support, or None where there is none.
+
+        Parameters
+        ----------
+        points : M correspondences, best first.
+        max_error_px : largest epipolar error of a correspondence that supports a pose, in pixels of the
+            mean focal length: the Sampson error in PoseLib and COLMAP, the library's own in OpenCV.
+        max_iterations : most hypotheses that are tried.
+        seed : the only source of randomness.
+        """
         ...
 
 
@@ -117,21 +126,30 @@ def _estimate_usac(
 def estimate_opencv_gcransac(
     points: Correspondences, max_error_px: float, max_iterations: int, seed: int
 ) -> RobustPose | None:
-    """Graph-cut RANSAC of OpenCV's USAC, the paper's estimator."""
+    """Graph-cut RANSAC of OpenCV's USAC (``USAC_ACCURATE``), the estimator of GTSfM.
+
+    Source: Barath and Matas, Graph-Cut RANSAC, CVPR 2018.
+    """
     return _estimate_usac(points, max_error_px, max_iterations, seed, cv2.USAC_ACCURATE)
 
 
 def estimate_opencv_magsac(
     points: Correspondences, max_error_px: float, max_iterations: int, seed: int
 ) -> RobustPose | None:
-    """MAGSAC++ of OpenCV's USAC."""
+    """MAGSAC++ of OpenCV's USAC (``USAC_MAGSAC``).
+
+    Source: Barath et al., MAGSAC++, a fast, reliable and accurate robust estimator, CVPR 2020.
+    """
     return _estimate_usac(points, max_error_px, max_iterations, seed, cv2.USAC_MAGSAC)
 
 
 def estimate_pycolmap(
     points: Correspondences, max_error_px: float, max_iterations: int, seed: int
 ) -> RobustPose | None:
-    """LO-RANSAC of COLMAP."""
+    """LO-RANSAC of COLMAP.
+
+    Source: Chum, Matas and Kittler, Locally optimized RANSAC, DAGM 2003.
+    """
     if len(points) < MINIMAL_SAMPLE:
         return None
     focal = points.mean_focal

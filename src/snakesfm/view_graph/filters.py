@@ -11,16 +11,20 @@ from snakesfm.view_graph.messages import edge_errors
 def refuse_by_cycles(
     edge_count: int, cycles: Cycles, first_pass: str, second_pass: str, max_error_rad: float
 ) -> Array:
-    """The filter of the paper: the smallest, then the median error of each edge's 3-cycles.
+    """The filter of GTSfM: the smallest, then the median error of each edge's 3-cycles.
 
     Parameters
     ----------
+    edge_count : E.
+    cycles : 3-cycles of the E edges, with their errors in radians.
     first_pass, second_pass : ``min``, ``median`` or ``none``; the second sees the survivors' cycles only.
     max_error_rad : larger errors refuse an edge.
 
     Returns
     -------
     (E,) str, ``cycle_min`` or ``cycle_median`` where refused, else ``kept``; an edge in no cycle is kept.
+
+    Source: Baid et al., Distributed Global Structure-from-Motion with a Deep Front-End, arXiv 2311.18801.
     """
     reasons = np.full(edge_count, "kept", dtype=object)
     for statistic in (first_pass, second_pass):
@@ -40,6 +44,15 @@ def refuse_by_messages(
 ) -> Array:
     """Refuse edges whose error, estimated by message passing between cycles, is too large.
 
+    The estimate and its source: see :func:`snakesfm.view_graph.messages.edge_errors`.
+
+    Parameters
+    ----------
+    edge_count : E.
+    cycles : 3-cycles of the E edges, with their errors in radians.
+    inlier_counts : (E,) inlier matches of each edge.
+    max_error_rad : larger errors refuse an edge.
+
     Returns
     -------
     (E,) str, ``cycle_message`` where refused, else ``kept``; an edge in no cycle is kept.
@@ -50,6 +63,12 @@ def refuse_by_messages(
 
 def keep_largest_component(node_count: int, pairs: Array, reasons: Array) -> tuple[Array, Array]:
     """Refuse kept edges outside the largest component.
+
+    Parameters
+    ----------
+    node_count : number N of images.
+    pairs : (E,2) int, images of each edge.
+    reasons : (E,) str, ``kept`` or what refused the edge before.
 
     Returns
     -------

@@ -110,3 +110,36 @@ def test_fisheye_images_are_warped_even_where_all_terms_are_0(
 def test_an_image_of_another_size_than_its_camera_is_named(tmp_path) -> None:
     with pytest.raises(ImageError, match=r"a\.\w+ has 560 x 380 pixels, but its camera 570 x 380: restore"):
         undistort(tmp_path, "SIMPLE_RADIAL", DISTORTED["SIMPLE_RADIAL"], width=560)
+
+
+@pytest.mark.parametrize("suffix", [".webp", ".png", ".tif", ".jpg"])
+def test_what_colmap_cannot_read_is_undistorted_too(tmp_path, suffix: str) -> None:
+    images, sparse = tmp_path / "images", tmp_path / "sparse"
+    (images / "a").mkdir(parents=True)
+    sparse.mkdir()
+    shown = np.full((480, 640, 3), 90, np.uint8)
+    cv2.circle(shown, (200, 150), 100, (200, 230, 210), -1)
+    file = images / "a" / f"1{suffix}"
+    if suffix in (".webp", ".jpg"):
+        Image.fromarray(shown).save(file, "WEBP", lossless=True)
+    else:
+        # 12 bits in 16
+        cv2.imwrite(str(file), cv2.cvtColor(shown.astype(np.uint16) << 4, cv2.COLOR_RGB2BGR))
+    model = pycolmap.Reconstruction()
+    lens = pycolmap.Camera(
+        camera_id=1, model="SIMPLE_RADIAL", width=640, height=480, params=[500, 320, 240, -0.1]
+    )
+    model.add_camera_with_trivial_rig(lens)
+    model.add_image_with_trivial_frame(
+        pycolmap.Image(name=f"a/1{suffix}", camera_id=1, image_id=1), pycolmap.Rigid3d()
+    )
+    model.write_binary(str(sparse))
+    write_undistorted(tmp_path / "flat", sparse, images, None, 1)
+    (camera,) = pycolmap.Reconstruction(str(tmp_path / "flat" / "sparse" / "0")).cameras.values()
+    found = np.asarray(Image.open(tmp_path / "flat" / "images" / "a" / f"1{suffix}").convert("RGB"))
+    assert found.shape == (camera.height, camera.width, 3)
+    center = found[camera.height // 2, camera.width // 2]
+    tolerance = 4 if suffix == ".jpg" else 0
+    circle = np.median(found[found[..., 1] > 160], axis=0)
+    np.testing.assert_allclose(circle, (200, 230, 210), atol=tolerance)
+    np.testing.assert_allclose(center, shown[240, 320], atol=tolerance)

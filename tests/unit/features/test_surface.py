@@ -1,6 +1,5 @@
 """A surface through points, and what it hides."""
 
-import importlib
 import sys
 
 import numpy as np
@@ -13,14 +12,6 @@ from snakesfm.features.surface import Surface
 def sphere(count=2000):
     points = np.random.default_rng(0).normal(size=(count, 3))
     return points / np.linalg.norm(points, axis=1, keepdims=True)
-
-
-@pytest.fixture
-def open3d():
-    try:
-        return importlib.import_module("open3d")
-    except (ImportError, Warning):
-        pytest.skip("the extra 'surface' is not installed, or libraries that open3d needs are missing")
 
 
 def test_a_sphere_hides_its_far_side(open3d):

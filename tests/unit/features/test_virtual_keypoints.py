@@ -3,29 +3,22 @@
 import numpy as np
 import pycolmap
 import pytest
+from known_model import SIZE, synthesize_model
 
 from snakesfm.errors import ConfigError
 from snakesfm.evaluation.colmap_model import read_model
-from snakesfm.features.keypoints import KeypointSource
 from snakesfm.features.virtual import VirtualKeypoints
 from snakesfm.features.virtual_points import ViewPoints
 from snakesfm.matching.matcher import MATCHERS
 
-SIZE = (1024, 768)
-
 
 @pytest.fixture(scope="module")
 def model():
-    pycolmap.logging.minloglevel = 2
-    options = pycolmap.SyntheticDatasetOptions()
-    options.num_rigs, options.num_cameras_per_rig, options.num_frames_per_rig = 1, 1, 4
-    options.num_points3D = 60
-    return pycolmap.synthesize_dataset(options)
+    return synthesize_model()
 
 
 def test_keypoints_are_exact_projections_of_what_an_image_observes(model):
     source = VirtualKeypoints(model)
-    assert isinstance(source, KeypointSource)
     for image in model.images.values():
         found = source.read(image.name, SIZE)
         ids = found.descriptors.copy().view("<u4").ravel()
@@ -34,14 +27,6 @@ def test_keypoints_are_exact_projections_of_what_an_image_observes(model):
         for place, number in zip(found.keypoints, ids.tolist(), strict=True):
             expected = image.project_point(model.points3D[number].xyz)
             np.testing.assert_allclose(place, expected, atol=1e-3)
-
-
-def test_an_image_of_another_size_than_its_camera_is_scaled(model):
-    source = VirtualKeypoints(model)
-    name = next(iter(model.images.values())).name
-    whole, half = source.read(name, SIZE), source.read(name, (512, 384))
-    np.testing.assert_allclose(half.keypoints, whole.keypoints / 2, atol=1e-3)
-    assert half.image_size == (512, 384)
 
 
 def test_the_matcher_pairs_the_same_points_and_no_others(model):

@@ -40,11 +40,6 @@ def middle_pair(survey: Survey) -> tuple[int, int]:
     return tuple(pairs[order[len(order) // 20]].tolist())
 
 
-def test_names_are_sorted_and_different(survey: Survey) -> None:
-    assert survey.names == sorted(set(survey.names))
-    assert len(survey.names) == len(survey.centers) == len(survey.rotations)
-
-
 def test_keypoints_lie_where_their_landmarks_project(survey: Survey) -> None:
     image = len(survey.names) // 2
     found = sight(survey, image, 3, DetectorModel(displaced=0.0), descriptors=False)
