@@ -117,7 +117,7 @@ def render_page(results: Sequence[Result], machine: Mapping[str, str], command: 
         kind = (
             "independent"
             if result.truth
-            else "COLMAP's reconstruction of these images, which favours the software that made it"
+            else "COLMAP's reconstruction, which favours the software that made it"
         )
         lines += ["", f"## {name}", ""]
         lines.append(f"{result.images} images; intrinsics {given}; the reference is {kind}.")
@@ -156,9 +156,8 @@ def _summary(sets: Mapping[str, Result], groups: Mapping[Key, list[Result]]) -> 
         "## Summary",
         "",
         "Differences to the better of COLMAP's two mappers; * marks independent references, which are no "
-        "COLMAP model of these images (laser scans, calibrated motion, GPS/INS; Lund: another system's reconstruction; "
-        "Reichstag: COLMAP's of the whole collection). The other references were made by COLMAP's incremental mapper "
-        "from the same images: there its rows show how well it repeats itself.",
+        "COLMAP model of these images. The other references were made by COLMAP's incremental mapper: there its rows "
+        "show how well it repeats itself.",
         "",
     ]
     measures = ("@3", "@5", "registered")

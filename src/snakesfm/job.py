@@ -213,7 +213,7 @@ def _fail(call: Call, error: Exception, terminal: Any) -> None:
         )
         _print_trace()
     elif type(error).__name__ == "OutOfMemoryError":
-        sentence = "Not enough memory on the CUDA device: set batch_size=1, smaller images, or device=cpu."
+        sentence = "Not enough memory on the GPU: set batch_size=1, smaller images, or device=cpu."
         _print_trace()
     else:
         _print_trace()

@@ -146,7 +146,7 @@ class ScenePlan:
 
     def gpus(self, stage: str) -> int:
         """How many GPUs a job of a stage makes use of."""
-        return 1 if self.models(stage) else 0
+        return 1 if self.models(stage) and self.configuration.device != "cpu" else 0
 
     def source_settings(self, stage: str) -> dict[str, Any]:
         """What a stage is told of where known keypoints or matches are; nothing where it finds them."""

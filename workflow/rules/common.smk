@@ -14,6 +14,7 @@ from snakesfm.blocks import tile_names
 from snakesfm.config.configuration import SCENE_PATTERN, check_spelling
 from snakesfm.config_checks import check_given_once, check_keys
 from snakesfm.job_server import JobServer
+from snakesfm.local_gpu import limit_gpu_jobs
 from snakesfm.model_files import MODEL_FILES
 from snakesfm.plan import Plan
 from snakesfm.records import check_backend, check_folder, makes_nothing, split_words
@@ -228,8 +229,10 @@ def start_run():
         RUN.keep_configuration(workflow)
     except SnakesfmError as error:
         raise refusal(error) from None
-    if workflow.local_exec and not workflow.deployment_settings.deployment_method:
-        JOB_SERVER.start(MALLOC)
+    if workflow.local_exec:
+        limit_gpu_jobs(workflow.scheduler)
+        if not workflow.deployment_settings.deployment_method:
+            JOB_SERVER.start(MALLOC)
 
 
 def finish_run(log):

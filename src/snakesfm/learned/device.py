@@ -1,10 +1,6 @@
 """The processor or CUDA device that networks run on, and the torch library itself."""
 
-import fcntl
 import importlib
-import os
-import tempfile
-from pathlib import Path
 from typing import Any
 
 from snakesfm.errors import ConfigError
@@ -27,7 +23,6 @@ def load_torch() -> Any:
 
 
 _wanted = "auto"
-_turns: dict[str, Any] = {}
 
 
 def use_device(wanted: str) -> None:
@@ -44,21 +39,6 @@ def use_device(wanted: str) -> None:
             "--profile profiles/slurm-gpu on a partition with GPUs, or set device=cpu."
         )
     _wanted = wanted
-    if choose_device().type == "cuda":
-        take_turn(str(load_torch().cuda.get_device_properties(0).uuid))
-
-
-def take_turn(device: str) -> None:
-    """Wait until no other job of this user on this machine holds the device, then hold it to the end.
-
-    Two jobs together often do not fit into its memory, and they are no faster than one after the other.
-    ``device`` is what identifies it among all of the machine, whichever of them the process may see.
-    """
-    if device in _turns:
-        return
-    path = Path(tempfile.gettempdir()) / f"snakesfm-{os.getuid()}-{device}.lock"
-    _turns[device] = path.open("a")
-    fcntl.flock(_turns[device], fcntl.LOCK_EX)
 
 
 def choose_device() -> Any:

@@ -39,18 +39,15 @@ Matches = tuple[Array, Array]
 
 REUSES_FORMER = True
 COLUMNS = ("keypoints", "descriptors", "scores", "scales", "angles")
-# descriptors of so many second images take 20 MB at 5,000 keypoints
-HELD_IMAGES = 32
-# reading a picture takes longer than descriptors; so many take 140 MB at 840 x 632 pixels
-HELD_PICTURES = 256
+# second images: descriptors of 5,000 keypoints take 160 MB, pictures of 840 x 632 pixels 140 MB
+HELD_IMAGES = 256
 
 
 def run(job: StageJob) -> None:
     """Match pair after pair, taking over pairs whose images and options are unchanged.
 
     Writes PairMatches, or PairCoordinates where there are no keypoints. The features (or the pictures) of
-    ``HELD_IMAGES`` (``HELD_PICTURES``) images and of a network's batch are held at a time, whatever the
-    size of the blocks.
+    ``HELD_IMAGES`` images and of a network's batch are held at a time, whatever the size of the blocks.
 
     Raises
     ------
@@ -73,9 +70,7 @@ def run(job: StageJob) -> None:
         results = {row: former[digest] for row, digest in enumerate(digests) if digest in former}
         reused = len(results)
         progress = job.progress(len(pairs) - reused, "pairs")
-        read_second = functools.lru_cache(HELD_PICTURES if free else HELD_IMAGES)(
-            lambda j: matcher.prepare_second(source.read(j))
-        )
+        read_second = functools.lru_cache(HELD_IMAGES)(lambda j: matcher.prepare_second(source.read(j)))
         held, first = -1, None
         # pairs are sorted, so that each first image is prepared once
         missing = [row for row in range(len(pairs)) if row not in results]

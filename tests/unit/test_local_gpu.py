@@ -1,0 +1,26 @@
+"""One job at a time on the GPU of a machine."""
+
+from types import SimpleNamespace
+
+import pytest
+
+from snakesfm.local_gpu import DRIVER_TOOLS, limit_gpu_jobs
+
+
+@pytest.mark.parametrize("tool", DRIVER_TOOLS)
+def test_a_machine_with_a_gpu_runs_one_job_on_it(monkeypatch, tmp_path, tool):
+    monkeypatch.setenv("PATH", str(tmp_path))
+    scheduler = SimpleNamespace(global_resources={"_cores": 8}, resources={"_cores": 8})
+    limit_gpu_jobs(scheduler)
+    assert scheduler.global_resources == scheduler.resources == {"_cores": 8}
+    (tmp_path / tool).touch(0o755)
+    limit_gpu_jobs(scheduler)
+    assert scheduler.global_resources == scheduler.resources == {"_cores": 8, "gpu": 1}
+
+
+def test_a_number_of_the_user_stays(monkeypatch, tmp_path):
+    monkeypatch.setenv("PATH", str(tmp_path))
+    (tmp_path / DRIVER_TOOLS[0]).touch(0o755)
+    scheduler = SimpleNamespace(global_resources={"gpu": 4}, resources={"gpu": 4})
+    limit_gpu_jobs(scheduler)
+    assert scheduler.global_resources == scheduler.resources == {"gpu": 4}
