@@ -12,6 +12,7 @@ from pathlib import Path
 from benchmarks import ROOT
 from benchmarks.compare.measure import Cost, run_measured, run_operation
 from benchmarks.compare.sets import ImageSet
+from snakesfm.blocks import choose_blocks, tile_names
 from snakesfm.job_logs import find_cost
 
 FEATURES = 5000
@@ -32,6 +33,8 @@ MAP = (
     "triangulate_tracks",
     "adjust_bundle",
 )
+GROUPS = {"extract": EXTRACT, "match": MATCH, "map": MAP}
+AFTER = ("export_model", "evaluate_model", "render_report")
 STARTED = re.compile(r"^(\d{4}-\d\d-\d\dT\S+) \w+ (?!done in )", re.M)
 
 
@@ -68,7 +71,7 @@ def stage_costs(logs: Path, whole: Cost) -> dict[str, Cost]:
     jobs = {path: path.read_text("utf-8") for path in logs.glob("*/*.log")}
     costs: dict[str, Cost] = {}
     since = min(_clock(found[-1]) for text in jobs.values() if (found := STARTED.findall(text)))
-    for name, stages in (("extract", EXTRACT), ("match", MATCH), ("map", MAP)):
+    for name, stages in GROUPS.items():
         ends = [
             found
             for path, text in jobs.items()
@@ -80,6 +83,19 @@ def stage_costs(logs: Path, whole: Cost) -> dict[str, Cost]:
         costs[name] = Cost(round(until - since, 2), round(cpu_seconds, 2), peak_mib, whole.others)
         since = until
     return costs
+
+
+def job_counts(images: int) -> dict[str, int]:
+    """How many jobs each group of stages has with default options, and how many come ``after`` the model.
+
+    No group has jobs that describe images: these run beyond 1,000 images only.
+    """
+    blocks = choose_blocks(images)
+    tiles = len(tile_names(blocks))
+    jobs = {"extract_features": blocks, "match_pairs": tiles, "estimate_two_view": tiles}
+    jobs |= {"learn_vocabulary": 0, "describe_images": 0}
+    groups = {**GROUPS, "after": AFTER}
+    return {name: sum(jobs.get(stage, 1) for stage in stages) for name, stages in groups.items()}
 
 
 def _clock(text: str) -> float:

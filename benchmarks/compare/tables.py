@@ -142,10 +142,13 @@ def _explanation() -> list[str]:
         "Cells are medians over the seeds, with least and greatest where they differ. AUC: area under the curve of "
         "relative-pose errors (the larger of rotation and translation direction) up to 1, 3 and 5 degrees; global: of "
         "errors after alignment; in per cent, images without a pose count as wrong. A run without a model counts as 0. "
-        "Timings marked ~ were all measured while others used the processor: the shortest is given. Peak memory is the sum over processes "
-        "that ran together, in (b) for snakesfm that of its largest mapping job. The mapping part of snakesfm runs from the last two-view geometry to the adjusted model, "
-        "with Snakemake's time between jobs. Ratios compare snakesfm with the better of COLMAP's two mappers in each "
-        "column: above 1, snakesfm is better. snakesfm's row in (b) is the same run as in (a).",
+        "Timings marked ~ were all measured while others used the processor: the shortest is given. Peak memory is the "
+        "sum over processes that ran together, in (b) for snakesfm that of its largest mapping job. The mapping part of "
+        "snakesfm runs from the last two-view geometry to the adjusted model, with Snakemake's time between jobs. CPU "
+        "seconds of extract, match and map are for COLMAP those of whole processes; for snakesfm they are what the jobs "
+        "measured and, in equal parts for each job, what else its run took (Snakemake, the start of jobs, export, "
+        "evaluation and report). Ratios compare snakesfm with the better of COLMAP's two mappers in each column: above 1, "
+        "snakesfm is better. snakesfm's row in (b) is the same run as in (a).",
     ]
 
 

@@ -9,7 +9,7 @@ import pytest
 
 from benchmarks.compare.ablate import DEFAULT, read_ablations, render_ablations
 from benchmarks.compare.measure import Cost
-from benchmarks.compare.methods import stage_costs
+from benchmarks.compare.methods import job_counts, stage_costs
 from benchmarks.compare.results import GLOBAL, INCREMENTAL, OURS, OWN, SAME, Result, read_results
 from benchmarks.compare.run import Campaign
 from benchmarks.compare.summary import COLUMNS, best_peer, gap, group, ratios, speed, spread, tally
@@ -109,6 +109,30 @@ def test_snakesfm_takes_part_on_the_same_features_with_its_mapping(
     assert len(read) == len(results) + 3
     assert {item.method for item in shared} == {OURS}
     assert all(set(item.stages) == {"map"} for item in shared)
+
+
+def test_what_a_run_takes_beside_its_jobs_is_shared_out_among_them(tmp_path: Path) -> None:
+    # 12 images: 2 blocks, 3 tiles; 21 jobs
+    assert job_counts(12) == {"extract": 4, "match": 7, "map": 7, "after": 3}
+    assert job_counts(200) == {"extract": 6, "match": 21, "map": 7, "after": 3}
+    measured = {"extract": 5.0, "match": 2.0, "map": 0.5, "total": 9.6}
+    stages = {name: Cost(1.0, seconds, 10.0) for name, seconds in measured.items()}
+    ours = replace(BLANK, images=12, stages=stages)
+    peer = replace(ours, method=GLOBAL)
+    failed = replace(ours, seed=1, failure="stopped", stages={"failed": Cost(1.0, 2.0, 3.0)})
+    for item in (ours, peer, failed):
+        item.write(tmp_path)
+    assert ours.stored(tmp_path) == ours
+    read = {(item.method, item.setting, item.seed): item.stages for item in read_results(tmp_path)}
+    shared = {name: cost.cpu_seconds for name, cost in read[OURS, OWN, 0].items()}
+    assert shared == {"extract": 5.4, "match": 2.7, "map": 1.2, "total": 9.6}
+    assert read[OURS, OWN, 0]["map"].seconds == 1.0
+    assert read[OURS, SAME, 0] == {"map": read[OURS, OWN, 0]["map"]}
+    assert (read[GLOBAL, OWN, 0], read[OURS, OWN, 1]) == (peer.stages, failed.stages)
+    # rounding can make the parts more than the whole
+    stages["total"] = Cost(1.0, 7.0, 10.0)
+    replace(ours, stages=stages).write(tmp_path)
+    assert {item.stages["map"].cpu_seconds for item in read_results(tmp_path) if item.seed == 0} == {0.5}
 
 
 def test_page_and_csv_hold_what_was_measured(results: list[Result]) -> None:
