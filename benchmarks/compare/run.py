@@ -91,7 +91,7 @@ class Campaign:
     ) -> None:
         """COLMAP's mappers after its own front-end, which they share."""
         front = work / "colmap"
-        inputs = version("pycolmap")
+        inputs = describe_front_end(len(image_set.camera_groups()))
         runs = [replace(blank, method=m, seed=s, inputs=inputs) for s in seeds for m in peers]
         if all(self.takes_over(result) for result in runs):
             return
@@ -184,6 +184,14 @@ def _report(result: Result) -> Result:
         text += "" if result.undisturbed else " (disturbed)"
     print(f"{result.image_set} {result.method} {result.setting} seed {result.seed}: {text}", flush=True)
     return result
+
+
+def describe_front_end(groups: int) -> str:
+    """How COLMAP's features are made: by which version and, of several groups of cameras, all at once.
+
+    The number of groups sets these apart from results whose groups were extracted one after the other.
+    """
+    return version("pycolmap") + (f", {groups} groups of cameras at once" if groups > 1 else "")
 
 
 def source_digest() -> str:
