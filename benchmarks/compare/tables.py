@@ -139,8 +139,9 @@ def _explanation() -> list[str]:
         "fixed; openMVG takes them only where one camera without distortion took all images. Everything runs on the "
         "processor, with as many threads as there are cores, in processes of its own.",
         "",
-        "Cells are medians over the seeds, with least and greatest where they differ. AUC: area under the curve of "
-        "relative-pose errors (the larger of rotation and translation direction) up to 1, 3 and 5 degrees; global: of "
+        "Cells are medians over the seeds, with least and greatest where they differ. COLMAP's own features, matches and "
+        "their verification are made once for all seeds, so its spread is that of the mappers. AUC: area under the curve "
+        "of relative-pose errors (the larger of rotation and translation direction) up to 1, 3 and 5 degrees; global: of "
         "errors after alignment; in per cent, images without a pose count as wrong. A run without a model counts as 0. "
         "Timings marked ~ were all measured while others used the processor: the shortest is given. Peak memory is the "
         "sum over processes that ran together, in (b) for snakesfm that of its largest mapping job. The mapping part of "
