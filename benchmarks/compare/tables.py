@@ -149,7 +149,8 @@ def _explanation() -> list[str]:
         "seconds of extract, match and map are for COLMAP those of whole processes; for snakesfm they are what the jobs "
         "measured and, in equal parts for each job, what else its run took (Snakemake, the start of jobs, export, "
         "evaluation and report). Ratios compare snakesfm with the better of COLMAP's two mappers in each column: above 1, "
-        "snakesfm is better. snakesfm's row in (b) is the same run as in (a).",
+        "snakesfm is better; there is none of wall clocks where only one of the two was disturbed. snakesfm's row in (b) "
+        "is the same run as in (a).",
     ]
 
 
@@ -185,8 +186,7 @@ def _summary(sets: Mapping[str, Result], groups: Mapping[Key, list[Result]]) -> 
     for name, result in sets.items():
         cells = [name, str(result.images)]
         for setting, key, _, method in SPEEDS:
-            found = speed(key, groups, name, setting, method)
-            cells.append("" if found is None else f"{'~' if found[1] else ''}{found[0]:.1f}x")
+            cells.append(_ratio_cell(speed(key, groups, name, setting, method), ".1f", "x"))
         lines.append(markdown_row(cells))
     return lines
 
@@ -229,9 +229,16 @@ def _table(
         lines.append(markdown_row([method, *cells]))
     if any(method == OURS for method, _ in rows) and len(rows) > 1:
         found = ratios(groups, name, setting)
-        cells = ["" if (value := found[columns[k].key]) is None else f"{value:.3g}" for k in used]
+        cells = [_ratio_cell(found[columns[k].key], ".3g") for k in used]
         lines.append(markdown_row(["*ratio*", *cells]))
     return lines + (["", *failures] if failures and columns is ACCURACY else [])
+
+
+def _ratio_cell(found: tuple[float, bool] | None, style: str, unit: str = "") -> str:
+    if found is None:
+        return ""
+    value, disturbed = found
+    return f"{'~' if disturbed else ''}{value:{style}}{unit}"
 
 
 def _cell(column: Column, found: Spread | None) -> str:

@@ -56,12 +56,13 @@ def test_ratios_are_to_the_better_peer_and_above_one_where_snakesfm_is_better(
     results: list[Result],
 ) -> None:
     groups = group(results)
-    assert best_peer(column(AREA), groups, "castle", OWN) == 88.0
-    assert best_peer(column("total_seconds"), groups, "castle", OWN) == 10.0
+    assert best_peer(column(AREA), groups, "castle", OWN).median == 88.0
+    assert best_peer(column("total_seconds"), groups, "castle", OWN).median == 10.0
+    assert best_peer(column(AREA), groups, "castle", SAME) is None
     found = ratios(groups, "castle", OWN)
-    assert found[AREA] == pytest.approx(91.0 / 88.0)
-    assert found["total_seconds"] == pytest.approx(2.5)
-    assert found["position_error_median"] == pytest.approx(2.5)
+    assert found[AREA] == (pytest.approx(91.0 / 88.0), False)
+    assert found["total_seconds"] == (pytest.approx(2.5), False)
+    assert found["position_error_median"] == (pytest.approx(2.5), False)
     assert found["points"] is None
     assert gap(AREA, groups, "castle", OWN) == pytest.approx(3.0)
     assert gap(AREA, groups, "castle", SAME) is None
@@ -79,6 +80,14 @@ def test_disturbed_timings_count_only_where_there_are_no_others() -> None:
     groups = group([calm, result(INCREMENTAL, 0, 80.0, 16.0, others=0.5)])
     assert speed("total_seconds", groups, "castle", OWN, INCREMENTAL) is None
     assert speed("total_cpu_seconds", groups, "castle", OWN, INCREMENTAL) == (8.0, True)
+    found = ratios(groups, "castle", OWN)
+    assert (found["total_seconds"], found["total_cpu_seconds"]) == (None, (8.0, True))
+    assert found[AREA] == (pytest.approx(90.0 / 80.0), False)
+    groups = group([loud, result(INCREMENTAL, 0, 80.0, 18.0, others=0.5)])
+    assert ratios(groups, "castle", OWN)["total_seconds"] == (2.0, True)
+    assert "| *ratio* | ~2 | ~2 | ~2 | ~2 | ~2 | ~2 | 0.99 |" in render_page(
+        [*groups["castle", OWN, OURS], *groups["castle", OWN, INCREMENTAL]], {}, "compare"
+    )
 
 
 def test_what_was_disturbed_is_measured_again_where_that_is_asked_for(tmp_path: Path) -> None:
