@@ -7,9 +7,11 @@ import sys
 from collections.abc import Iterable
 from dataclasses import asdict
 from datetime import datetime
+from importlib.metadata import version
 from pathlib import Path
 
 from benchmarks import ROOT
+from benchmarks.compare.inputs import inputs_of
 from benchmarks.compare.measure import Cost, run_measured, run_operation
 from benchmarks.compare.sets import ImageSet
 from snakesfm.blocks import choose_blocks, tile_names
@@ -103,10 +105,15 @@ def _clock(text: str) -> float:
 
 
 def colmap_front_end(image_set: ImageSet, folder: Path, threads: int, limit_s: float) -> dict[str, Cost]:
-    """COLMAP's own features and matches of all pairs in folder/database.db, made once; the cost of both."""
+    """COLMAP's own features and matches of all pairs in folder/database.db, and the cost of both.
+
+    They are made once, and again where the version of pycolmap or what they start from is another one.
+    """
     record = folder / "cost.json"
-    if record.is_file():
-        return {name: Cost(**cost) for name, cost in json.loads(record.read_text("utf-8")).items()}
+    inputs = inputs_of(image_set, version("pycolmap"), FEATURES, threads)
+    stored = json.loads(record.read_text("utf-8")) if record.is_file() else {}
+    if stored.get("inputs") == inputs:
+        return {name: Cost(**cost) for name, cost in stored["costs"].items()}
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
     database = str(folder / "database.db")
@@ -122,7 +129,8 @@ def colmap_front_end(image_set: ImageSet, folder: Path, threads: int, limit_s: f
         "extract": run_operation("extract", extraction, folder / "extract.log", limit_s),
         "match": run_operation("match", matching, folder / "match.log", limit_s),
     }
-    record.write_text(json.dumps({name: asdict(cost) for name, cost in costs.items()}), "utf-8")
+    content = {"inputs": inputs, "costs": {name: asdict(cost) for name, cost in costs.items()}}
+    record.write_text(json.dumps(content), "utf-8")
     return costs
 
 

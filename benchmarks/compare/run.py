@@ -4,14 +4,14 @@ import contextlib
 import hashlib
 import shutil
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
 
-from benchmarks import ROOT
 from benchmarks.compare import methods
+from benchmarks.compare.inputs import source_digest
 from benchmarks.compare.measure import CommandError, Cost
 from benchmarks.compare.results import GLOBAL, INCREMENTAL, OPENMVG, OURS, OWN, SAME, Result
 from benchmarks.compare.sets import ImageSet
@@ -19,7 +19,6 @@ from snakesfm.evaluation.scores import score_model
 
 OPERATIONS = {INCREMENTAL: "map_incremental", GLOBAL: "map_global"}
 LARGE_SET = 60
-SOURCES = ("Snakefile", "config.yaml", "scripts", "workflow/rules", "src/snakesfm")
 Costs = dict[str, Cost]
 
 
@@ -192,17 +191,3 @@ def describe_front_end(groups: int) -> str:
     The number of groups sets these apart from results whose groups were extracted one after the other.
     """
     return version("pycolmap") + (f", {groups} groups of cameras at once" if groups > 1 else "")
-
-
-def source_digest() -> str:
-    """Digest of all of snakesfm that decides what the workflow computes."""
-    digest = hashlib.sha256()
-    for file in _source_files():
-        digest.update(file.relative_to(ROOT).as_posix().encode() + b"\0" + file.read_bytes())
-    return digest.hexdigest()
-
-
-def _source_files() -> Iterator[Path]:
-    for name in SOURCES:
-        path = ROOT / name
-        yield from [path] if path.is_file() else sorted(path.rglob("*.py")) + sorted(path.rglob("*.smk"))

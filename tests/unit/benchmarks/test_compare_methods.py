@@ -1,5 +1,6 @@
 """The comparison's processes: what is measured of them, how they fail, and that COLMAP's mappers run."""
 
+import shutil
 import sys
 from pathlib import Path
 
@@ -8,8 +9,10 @@ import pycolmap
 import pytest
 from PIL import Image
 
-from benchmarks.compare.measure import CommandError, run_measured, run_operation
-from benchmarks.compare.methods import colmap_map
+from benchmarks.compare import methods
+from benchmarks.compare.inputs import inputs_of
+from benchmarks.compare.measure import CommandError, Cost, run_measured, run_operation
+from benchmarks.compare.methods import colmap_front_end, colmap_map
 from benchmarks.compare.peers import extract
 from benchmarks.compare.run import describe_front_end
 from benchmarks.compare.sets import ImageSet, read_sets
@@ -114,6 +117,44 @@ def test_unknown_cameras_are_shared_as_in_the_reference(tmp_path: Path) -> None:
         {"names": names[3:5], "mode": "SINGLE"},
         {"names": names[5:], "mode": "PER_IMAGE"},
     ]
+
+
+def test_inputs_are_a_sets_files_whether_its_intrinsics_are_given_and_what_else_counts(
+    synthetic: Path, tmp_path: Path
+) -> None:
+    copy = tmp_path / "copy"
+    shutil.copytree(synthetic, copy)
+    before = inputs_of(ImageSet(synthetic, True, True), "4.2", 2)
+    assert before == inputs_of(ImageSet(copy, True, True), "4.2", 2)
+    (copy / "images" / "a.jpg").write_bytes(b"x")
+    others = [
+        inputs_of(ImageSet(copy, True, True), "4.2", 2),
+        inputs_of(ImageSet(synthetic, False, True), "4.2", 2),
+        inputs_of(ImageSet(synthetic, True, True), "4.22"),
+        inputs_of(ImageSet(synthetic, True, True), "4.3", 2),
+    ]
+    assert len({before, *others}) == 5
+
+
+def test_a_front_end_is_made_again_where_it_starts_from_something_else(
+    synthetic: Path, tmp_path: Path, monkeypatch
+) -> None:
+    done = []
+
+    def run(operation: str, arguments: dict, log: Path, limit_s: float) -> Cost:
+        done.append(operation)
+        return Cost(float(len(done)), 1.0, 1.0)
+
+    monkeypatch.setattr(methods, "run_operation", run)
+    known, withheld = ImageSet(synthetic, True, True), ImageSet(synthetic, False, True)
+    front = tmp_path / "front"
+    front.mkdir()
+    # one that was stored without what it started from
+    (front / "cost.json").write_text('{"extract": {"seconds": 9, "cpu_seconds": 9, "peak_mib": 9}}')
+    for image_set, threads, runs in ((known, 2, 1), (known, 2, 1), (withheld, 2, 2), (withheld, 1, 3)):
+        costs = colmap_front_end(image_set, front, threads, 60.0)
+        assert done == ["extract", "match"] * runs
+        assert [costs[name].seconds for name in ("extract", "match")] == [2 * runs - 1, 2 * runs]
 
 
 def extracted(images: Path, database: Path, groups: list[dict]) -> list[tuple[int, str, float]]:
