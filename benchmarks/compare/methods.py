@@ -7,13 +7,13 @@ import sys
 from collections.abc import Iterable
 from dataclasses import asdict
 from datetime import datetime
-from importlib.metadata import version
 from pathlib import Path
 
 from benchmarks import ROOT
 from benchmarks.compare.inputs import inputs_of
 from benchmarks.compare.measure import Cost, run_measured, run_operation
 from benchmarks.compare.sets import ImageSet
+from benchmarks.machine import describe_machine
 from snakesfm.blocks import choose_blocks, tile_names
 from snakesfm.job_logs import find_cost
 
@@ -107,10 +107,11 @@ def _clock(text: str) -> float:
 def colmap_front_end(image_set: ImageSet, folder: Path, threads: int, limit_s: float) -> dict[str, Cost]:
     """COLMAP's own features and matches of all pairs in folder/database.db, and the cost of both.
 
-    They are made once, and again where the version of pycolmap or what they start from is another one.
+    They are made once, and again where the machine, the version of pycolmap or what they start from is
+    another one.
     """
     record = folder / "cost.json"
-    inputs = inputs_of(image_set, version("pycolmap"), FEATURES, threads)
+    inputs = inputs_of(image_set, describe_machine(["pycolmap"]), FEATURES, threads)
     stored = json.loads(record.read_text("utf-8")) if record.is_file() else {}
     if stored.get("inputs") == inputs:
         return {name: Cost(**cost) for name, cost in stored["costs"].items()}

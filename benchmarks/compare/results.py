@@ -16,6 +16,7 @@ METHODS = (OURS, INCREMENTAL, GLOBAL, OPENMVG)
 PEERS = (INCREMENTAL, GLOBAL)
 OWN, SAME = "own", "same"
 SETTINGS = (OWN, SAME)
+PACKAGES = ("snakesfm", "pycolmap", "openmvg-rs", "snakemake", "opencv-python-headless", "poselib", "numpy")
 
 
 @dataclass(frozen=True)
@@ -32,6 +33,7 @@ class Result:
     stages : cost of extract, match, map and total; those that the setting has. Of snakesfm the first three
         are what its jobs measured of themselves; see ``share_out``.
     inputs : digest of what the run started from; a result of other inputs is made again.
+    machine : that it was measured on, and the versions; empty where it was stored without.
     """
 
     image_set: str
@@ -44,6 +46,7 @@ class Result:
     inputs: str = ""
     failure: str = ""
     date: str = ""
+    machine: str = ""
     metrics: dict[str, Any] = field(default_factory=dict)
     stages: dict[str, Cost] = field(default_factory=dict)
 

@@ -6,15 +6,15 @@ import shutil
 import traceback
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
 
 from benchmarks.compare import methods
 from benchmarks.compare.inputs import source_digest
 from benchmarks.compare.measure import CommandError, Cost
-from benchmarks.compare.results import GLOBAL, INCREMENTAL, OPENMVG, OURS, OWN, SAME, Result
+from benchmarks.compare.results import GLOBAL, INCREMENTAL, OPENMVG, OURS, OWN, PACKAGES, SAME, Result
 from benchmarks.compare.sets import ImageSet
+from benchmarks.machine import describe_machine, today
 from snakesfm.evaluation.scores import score_model
 
 OPERATIONS = {INCREMENTAL: "map_incremental", GLOBAL: "map_global"}
@@ -160,7 +160,7 @@ class Campaign:
         """Run, evaluate and store, unless that is stored already; a failure is stored too."""
         if self.takes_over(result):
             return
-        result = replace(result, date=datetime.now(UTC).strftime("%Y-%m-%d"))
+        result = replace(result, date=today(), machine=describe_machine(PACKAGES))
         try:
             result = replace(result, stages=run())
             result = replace(result, metrics=score_model(model, image_set.reference)[0])

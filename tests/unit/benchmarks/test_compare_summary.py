@@ -2,18 +2,30 @@
 
 import csv
 import io
+import json
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
+from benchmarks.compare.__main__ import add_command, write_tables
 from benchmarks.compare.ablate import DEFAULT, read_ablations, render_ablations
 from benchmarks.compare.measure import Cost
 from benchmarks.compare.methods import job_counts, stage_costs
-from benchmarks.compare.results import GLOBAL, INCREMENTAL, OURS, OWN, SAME, Result, read_results
+from benchmarks.compare.results import (
+    GLOBAL,
+    INCREMENTAL,
+    OURS,
+    OWN,
+    PACKAGES,
+    SAME,
+    Result,
+    read_results,
+)
 from benchmarks.compare.run import Campaign
 from benchmarks.compare.summary import COLUMNS, best_peer, gap, group, ratios, speed, spread, tally
 from benchmarks.compare.tables import render_csv, render_page
+from benchmarks.machine import describe_machine
 from snakesfm.errors import ConfigError
 
 AREA = "relative_pose_auc_1deg"
@@ -86,7 +98,7 @@ def test_disturbed_timings_count_only_where_there_are_no_others() -> None:
     groups = group([loud, result(INCREMENTAL, 0, 80.0, 18.0, others=0.5)])
     assert ratios(groups, "castle", OWN)["total_seconds"] == (2.0, True)
     assert "| *ratio* | ~2 | ~2 | ~2 | ~2 | ~2 | ~2 | 0.99 |" in render_page(
-        [*groups["castle", OWN, OURS], *groups["castle", OWN, INCREMENTAL]], {}, "compare"
+        [*groups["castle", OWN, OURS], *groups["castle", OWN, INCREMENTAL]], "", ["compare"]
     )
 
 
@@ -147,8 +159,8 @@ def test_what_a_run_takes_beside_its_jobs_is_shared_out_among_them(tmp_path: Pat
 def test_page_and_csv_hold_what_was_measured(results: list[Result]) -> None:
     shared = [replace(item, setting=SAME) for item in results if item.method == OURS]
     peers = [result(GLOBAL, seed, 93.0, 1.0, SAME) for seed in range(3)]
-    page = render_page([*results, *shared, *peers], {"cores": "2"}, "compare --seeds 3")
-    assert "Measured 2026-01-02 with `compare --seeds 3`\non cores 2." in page
+    page = render_page([*results, *shared, *peers], "cores 2", ["compare --seeds 3"])
+    assert "Measured 2026-01-02 with `compare --seeds 3`\non cores 2.\n\n" in page
     rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in page.splitlines()]
     (gaps,) = [cells for cells in rows if cells[:1] == ["castle*"]]
     assert (gaps[1], gaps[4], gaps[5]) == ("+3.00", "+0", "-2.00")
@@ -165,6 +177,30 @@ def test_page_and_csv_hold_what_was_measured(results: list[Result]) -> None:
     assert len(runs) == len(results)
     assert {row["failure"] for row in runs} == {"", "crashed by SIGSEGV"}
     assert float(runs[0][AREA]) == 90.0
+
+
+def test_the_page_names_the_machines_and_commands_of_the_results_not_of_who_renders_them(
+    tmp_path: Path, results: list[Result]
+) -> None:
+    ours, other = results[0], replace(results[3], image_set="door", date="2026-01-05")
+    ours.write(tmp_path / "results")
+    # as those were stored that had no machine
+    file = ours.path(tmp_path / "results")
+    stored = json.loads(file.read_text())
+    del stored["machine"]
+    file.write_text(json.dumps(stored))
+    for command in ("compare --sets castle", "compare --sets door", "compare --sets castle"):
+        add_command(tmp_path, command)
+    write_tables(tmp_path, None)
+    here = describe_machine(PACKAGES)
+    commands = "`compare --sets castle`, `compare --sets door`"
+    page = (tmp_path / "benchmarks.md").read_text()
+    assert f"Measured 2026-01-02 with {commands}\non {here}.\n\n" in page
+    replace(other, machine="cores 64").write(tmp_path / "results")
+    write_tables(tmp_path, tmp_path / "own.md")
+    page = (tmp_path / "own.md").read_text()
+    assert f"Measured 2026-01-02 to 2026-01-05 with {commands}\n" in page
+    assert f"\n\n- {here}: castle\n- cores 64: door\n\n" in page
 
 
 def test_stage_costs_are_read_from_the_last_run_in_the_logs(tmp_path: Path) -> None:
