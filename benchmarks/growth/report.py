@@ -196,15 +196,17 @@ def _hours(
     if stage == "extract_features":
         total = EXTRACT_CPU_PER_IMAGE * images
         return total / 3600, total / 3600 / cores, "per image"
-    points = [(m.images, m.stages[stage].cpu) for m in measurements if m.comparable(stage)]
+    usable = [m for m in measurements if m.comparable(stage)]
+    points = [(m.images, m.stages[stage].cpu) for m in usable]
     if not points:
         return math.nan, math.nan, ""
     largest, cpu = max(points)
     fitted = exponent(points)
     slope = max(fitted or 1.0, 1.0)
     power = "assumed" if fitted is None else f"{slope:.2f}"
-    if stage in TILED:
-        need = max((m for m in measurements if stage in m.stages), key=lambda m: m.images).stages[stage]
+    counted = [m for m in usable if m.stages[stage].pairs]
+    if stage in TILED and counted:
+        need = max(counted, key=lambda m: m.images).stages[stage]
         total, power = need.cpu / need.pairs * pairs, "per pair"
     else:
         total = cpu * (images / largest) ** slope

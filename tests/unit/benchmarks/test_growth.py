@@ -83,6 +83,37 @@ def test_the_page_holds_all_runs_and_says_what_was_not_run(tmp_path: Path) -> No
     assert "2,000 images from extract_features;" in text
 
 
+def test_pairs_are_carried_on_from_the_largest_run_with_default_options_whose_tiles_are_there(
+    tmp_path: Path,
+) -> None:
+    def run(images: int, need: StageNeed, config: list[str]) -> Measurement:
+        return Measurement(
+            "aerial",
+            images,
+            4,
+            "extract_features",
+            10 * images,
+            config=config,
+            stages={"match_pairs": need},
+        )
+
+    counted = StageNeed(3, 36.0, 36.0, 12.0, 100.0, 10_000)
+    uncounted = StageNeed(3, 99.0, 99.0, 40.0, 100.0, 0)
+    runs = [
+        run(1000, counted, []),
+        run(2000, uncounted, []),
+        run(4000, StageNeed(3, 720.0, 720.0, 240.0, 100.0, 10_000), ["match_pairs={ratio: 0.9}"]),
+    ]
+    for chosen, start in (
+        (runs, "| `match_pairs` | 1.00 | 0.00 | per pair |"),
+        (runs[1:], "| `match_pairs` | 1.38 |"),
+    ):
+        write_report(chosen, tmp_path / "page.md", "a command")
+        text = (tmp_path / "page.md").read_text()
+        future = text[text.index("## On paper") :]
+        assert start in future
+
+
 def test_what_ran_with_other_options_is_shown_but_not_fitted(tmp_path: Path) -> None:
     def run(images: int, cpu: float, config: list[str]) -> Measurement:
         needs = {stage: StageNeed(1, cpu, cpu, cpu, 100.0) for stage in ("build_tracks", "adjust_bundle")}
