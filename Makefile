@@ -9,6 +9,9 @@ PYTHON ?= python3
 BIN := .venv/bin
 export PATH := $(CURDIR)/.venv/bin:$(PATH)
 
+# all install into one environment, also where MAKEFLAGS holds -j
+.NOTPARALLEL:
+
 .PHONY: setup cluster deep surface demo test check clean
 
 setup: .venv/installed

@@ -3,6 +3,7 @@
 import argparse
 import json
 import os
+import shlex
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -10,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks import ROOT
+from benchmarks.compare.inputs import inputs_of, source_digest
 from benchmarks.compare.sets import DATA, ImageSet, read_sets
 from snakesfm.errors import SnakesfmError
 
@@ -73,15 +75,18 @@ class SetTable:
         except SnakesfmError as error:
             sys.stderr.write(f"{error}\n")
             return 1
+        source = source_digest()
         for image_set in sets:
+            inputs = inputs_of(image_set, source, *given.options)
             for method in given.methods:
                 key = f"{image_set.name}|{method}"
-                if finished(values, image_set.name, method):
+                if finished(values, image_set.name, method) and values[key].get("inputs") == inputs:
                     continue
-                values[key] = self.measure(image_set, method, run)
+                values[key] = {"inputs": inputs, **self.measure(image_set, method, run)}
                 print(f"{key}: {values[key]}", flush=True)
                 store.write_text(json.dumps(values, indent=1, sort_keys=True) + "\n", "utf-8")
         text = self.render(values, [one.name for one in sets], given.methods)
+        text += f"\nOptions of the workflow: {describe_options(given.options)}.\n"
         (out / f"{self.name}.md").write_text(text, "utf-8")
         if given.page:
             self.page.write_text(text, "utf-8")
@@ -104,6 +109,11 @@ class SetTable:
         add("--limit", type=float, default=7200, help="longest time of one run in seconds")
         add("--page", action="store_true", help=f"write {self.page.relative_to(ROOT)} too")
         return parser.parse_args(arguments)
+
+
+def describe_options(options: Sequence[str]) -> str:
+    """What a page says of the options that all its runs had."""
+    return f"`{shlex.join(options)}`, all others default" if options else "default"
 
 
 def finished(values: Mapping[str, Value], name: str, method: str) -> bool:

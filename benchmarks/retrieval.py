@@ -4,7 +4,8 @@
 
 Two images overlap truly where the reference model shows at least 10 of its points in both, so sets whose
 reference has no points are left out. Descriptors are made by the workflow as users run it, into
-DIR/CHOICE/out/SET. DIR/retrieval.json holds what is there so far; --page writes docs/retrieval.md.
+DIR/CHOICE/out/SET. DIR/retrieval.json holds what is there so far. It is measured again where snakesfm, the
+set or --options are others than before; --page writes docs/retrieval.md.
 """
 
 import sys

@@ -5,6 +5,7 @@ import importlib.metadata
 from pathlib import Path
 from types import ModuleType
 
+import hypothesis
 import pytest
 from workflow_runner import Outcome, Workflow
 
@@ -17,6 +18,10 @@ ROOT = Path(__file__).resolve().parents[1]
 SMALL = DemoOptions(image_count=16, width=400, height=300)
 PACKAGES_WITH_WEIGHTS = (LIGHTGLUE, XFEAT)
 DATA = ROOT.parent / "shared" / "data"
+
+# the same examples each time, and no limit on the clock: other tests and daemons run beside
+hypothesis.settings.register_profile("tests", deadline=None, derandomize=True)
+hypothesis.settings.load_profile("tests")
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

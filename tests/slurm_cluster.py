@@ -234,7 +234,9 @@ class Cluster:
             if name in self.daemons:
                 self.kill(name, signal.SIGTERM)
         for pid in self._left_over():
-            os.kill(pid, signal.SIGKILL)
+            # it may have ended since
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGKILL)
 
     def _left_over(self) -> list[int]:
         """Processes that were started through this cluster and live on: a killed slurmd leaves its steps."""

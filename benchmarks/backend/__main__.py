@@ -32,12 +32,12 @@ from benchmarks.backend.problems import (
     read_real,
     synthesize,
 )
-from benchmarks.backend.report import Row, render
+from benchmarks.backend.report import Row, describe_origin, render
 
 COLUMNS = (
     "problem", "cameras", "edges", "outliers", "coherent", "seed", "method", "positions",
     "images", "mean_deg", "median_deg", "p90_deg", "mean_percent", "median_percent", "p90_percent",
-    "cpu_s", "peak_mib", "failure", "command",
+    "cpu_s", "peak_mib", "failure", "command", "made",
 )  # fmt: skip
 REAL = ("strecha_castle_p30", "middlebury_temple_ring", "statue_of_liberty_135",
         "sevenscenes_redkitchen_200", "seneca_aerial_167")  # fmt: skip
@@ -61,6 +61,7 @@ def main() -> int:
     parser.add_argument("--add", action="store_true", help="keep the rows that the CSV file has")
     arguments = parser.parse_args()
     command = shlex.join(["python", "-m", "benchmarks.backend", *sys.argv[1:]])
+    made = describe_origin()
     import_libraries()
     rows: list[Row] = []
     if arguments.add and arguments.csv.exists():
@@ -73,10 +74,10 @@ def main() -> int:
         for problem in problems(arguments):
             for method in arguments.methods:
                 for row in measure(problem, method, arguments.positions, arguments.timeout):
-                    rows.append(row | {"command": command})
+                    rows.append(row | {"command": command, "made": made})
                     writer.writerow(rows[-1])
                     file.flush()
-                    print(" ".join(row[column] for column in COLUMNS[:-1]), flush=True)
+                    print(" ".join(row[column] for column in COLUMNS[:-2]), flush=True)
     arguments.table.write_text(render(rows))
     return 0
 

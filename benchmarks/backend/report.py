@@ -1,33 +1,32 @@
 """The page of what was measured."""
 
-import importlib.metadata
-import os
-import platform
 from collections import defaultdict
-from datetime import date
 
 import numpy as np
 
+from benchmarks.machine import describe_machine, today
+
+PACKAGES = ("snakesfm", "pycolmap", "gtsam", "numpy")
 Row = dict[str, str]
 """Values of a row by its columns; those that do not apply are empty."""
 
 
 def render(rows: list[Row]) -> str:
     """Markdown: rotations, then positions, each over seeds; before them an overview of positions."""
-    versions = ", ".join(
-        f"{name} {importlib.metadata.version(name)}" for name in ("snakesfm", "pycolmap", "gtsam", "numpy")
-    )
-    commands = [f"- `{command}`" for command in dict.fromkeys(row["command"] for row in rows)]
+    origins: dict[str, dict[str, None]] = {}
+    for row in rows:
+        origins.setdefault(row.get("made") or describe_origin(), {})[row["command"]] = None
+    made = [
+        line
+        for origin, commands in origins.items()
+        for line in (f"{origin}. Made by", "", *(f"- `{command}`" for command in commands), "")
+    ]
     positioned = [row for row in rows if row["positions"]]
     return "\n".join(
         [
             "# The back-end on view graphs with known truth",
             "",
-            f"{date.today().isoformat()}, {os.cpu_count()} cores, {platform.machine()}, Python"
-            f" {platform.python_version()}, {versions}. Made by",
-            "",
-            *commands,
-            "",
+            *made,
             "Seconds are of the processor, of all threads; MiB are the largest memory above what Python,"
             " the libraries and the problem take. Cells are the median over seeds, in brackets the smallest"
             " and the largest.",
@@ -37,6 +36,11 @@ def render(rows: list[Row]) -> str:
             "",
         ]
     )
+
+
+def describe_origin() -> str:
+    """Date, machine and versions of what is measured now."""
+    return f"{today()}, {describe_machine(PACKAGES)}"
 
 
 def overview(rows: list[Row]) -> list[str]:

@@ -9,10 +9,11 @@ from pathlib import Path
 
 from benchmarks import ROOT
 from benchmarks.compare.ablate import ablate
-from benchmarks.compare.results import METHODS, read_results
+from benchmarks.compare.results import METHODS, PACKAGES, read_results
 from benchmarks.compare.run import Campaign
 from benchmarks.compare.sets import DATA, read_sets
-from benchmarks.compare.tables import describe_machine, render_csv, render_page
+from benchmarks.compare.tables import render_csv, render_page
+from benchmarks.machine import describe_machine
 from snakesfm.errors import SnakesfmError
 
 COMMANDS = ("run", "render", "ablate")
@@ -79,7 +80,7 @@ def main(arguments: list[str]) -> int:
             command = describe_command(given)
             for image_set in read_sets(given.data, given.sets, given.withhold_intrinsics):
                 campaign.run(image_set)
-                (given.out / "command.txt").write_text(command + "\n", "utf-8")
+                add_command(given.out, command)
                 write_tables(given.out, given.page)
         write_tables(given.out, given.page)
     except SnakesfmError as error:
@@ -99,13 +100,25 @@ def describe_command(given: argparse.Namespace) -> str:
     return " ".join(parts)
 
 
+def add_command(folder: Path, command: str) -> None:
+    """Add a command to those that made the results, unless it is among them."""
+    commands = read_commands(folder)
+    if command not in commands:
+        (folder / "command.txt").write_text("".join(f"{one}\n" for one in [*commands, command]), "utf-8")
+
+
+def read_commands(folder: Path) -> list[str]:
+    """The commands that made the results, the first one first."""
+    file = folder / "command.txt"
+    return file.read_text("utf-8").splitlines() if file.is_file() else []
+
+
 def write_tables(folder: Path, page: Path | None) -> None:
     """Write the page, and the CSV file beside it."""
     page = page or folder / "benchmarks.md"
     results = read_results(folder / "results")
-    command = folder / "command.txt"
-    text = command.read_text("utf-8").strip() if command.is_file() else "python -m benchmarks.compare"
-    page.write_text(render_page(results, describe_machine(), text), "utf-8")
+    commands = read_commands(folder) or ["python -m benchmarks.compare"]
+    page.write_text(render_page(results, describe_machine(PACKAGES), commands), "utf-8")
     page.with_suffix(".csv").write_text(render_csv(results), "utf-8")
 
 

@@ -1,6 +1,5 @@
 """What each option is worth: one change at a time, on all sets, re-making only what depends on it."""
 
-import hashlib
 import json
 import shutil
 from collections.abc import Mapping, Sequence
@@ -11,9 +10,9 @@ from typing import Any
 
 import yaml
 
+from benchmarks.compare.inputs import inputs_of, source_digest
 from benchmarks.compare.measure import CommandError
 from benchmarks.compare.methods import snakesfm
-from benchmarks.compare.run import source_digest
 from benchmarks.compare.sets import ImageSet
 from benchmarks.markdown import markdown_head, markdown_row
 from snakesfm.config.configuration import STAGES, load_configuration
@@ -76,7 +75,7 @@ def ablate(
     for image_set in sets:
         for ablation in ablations:
             key = f"{image_set.name}|{ablation.name}"
-            inputs = hashlib.sha256((digest + "".join(ablation.config())).encode()).hexdigest()
+            inputs = inputs_of(image_set, digest, *ablation.config())
             if values.get(key, {}).get("inputs") == inputs:
                 continue
             values[key] = {"inputs": inputs, **_measure(image_set, ablation, out, threads, limit_s)}

@@ -31,8 +31,8 @@ class Cost:
     seconds : wall clock.
     cpu_seconds : processor time, user and system, of all its processes.
     peak_mib : resident memory: the largest sampled sum over the processes that ran at the same time, or
-        the high-water mark of one process, whichever is more; pages that processes share count several
-        times.
+        the high-water mark of one process, whichever is more; in the sum, pages that processes share count
+        once.
     others : share of the machine's processor time that others used meanwhile, 0 to 1.
     """
 

@@ -10,8 +10,11 @@ from datetime import datetime
 from pathlib import Path
 
 from benchmarks import ROOT
+from benchmarks.compare.inputs import inputs_of
 from benchmarks.compare.measure import Cost, run_measured, run_operation
 from benchmarks.compare.sets import ImageSet
+from benchmarks.machine import describe_machine
+from snakesfm.blocks import choose_blocks, tile_names
 from snakesfm.job_logs import find_cost
 
 FEATURES = 5000
@@ -32,6 +35,8 @@ MAP = (
     "triangulate_tracks",
     "adjust_bundle",
 )
+GROUPS = {"extract": EXTRACT, "match": MATCH, "map": MAP}
+AFTER = ("export_model", "evaluate_model", "render_report")
 STARTED = re.compile(r"^(\d{4}-\d\d-\d\dT\S+) \w+ (?!done in )", re.M)
 
 
@@ -68,7 +73,7 @@ def stage_costs(logs: Path, whole: Cost) -> dict[str, Cost]:
     jobs = {path: path.read_text("utf-8") for path in logs.glob("*/*.log")}
     costs: dict[str, Cost] = {}
     since = min(_clock(found[-1]) for text in jobs.values() if (found := STARTED.findall(text)))
-    for name, stages in (("extract", EXTRACT), ("match", MATCH), ("map", MAP)):
+    for name, stages in GROUPS.items():
         ends = [
             found
             for path, text in jobs.items()
@@ -82,15 +87,34 @@ def stage_costs(logs: Path, whole: Cost) -> dict[str, Cost]:
     return costs
 
 
+def job_counts(images: int) -> dict[str, int]:
+    """How many jobs each group of stages has with default options, and how many come ``after`` the model.
+
+    No group has jobs that describe images: these run beyond 1,000 images only.
+    """
+    blocks = choose_blocks(images)
+    tiles = len(tile_names(blocks))
+    jobs = {"extract_features": blocks, "match_pairs": tiles, "estimate_two_view": tiles}
+    jobs |= {"learn_vocabulary": 0, "describe_images": 0}
+    groups = {**GROUPS, "after": AFTER}
+    return {name: sum(jobs.get(stage, 1) for stage in stages) for name, stages in groups.items()}
+
+
 def _clock(text: str) -> float:
     return datetime.fromisoformat(text).timestamp()
 
 
 def colmap_front_end(image_set: ImageSet, folder: Path, threads: int, limit_s: float) -> dict[str, Cost]:
-    """COLMAP's own features and matches of all pairs in folder/database.db, made once; the cost of both."""
+    """COLMAP's own features and matches of all pairs in folder/database.db, and the cost of both.
+
+    They are made once, and again where the machine, the version of pycolmap or what they start from is
+    another one.
+    """
     record = folder / "cost.json"
-    if record.is_file():
-        return {name: Cost(**cost) for name, cost in json.loads(record.read_text("utf-8")).items()}
+    inputs = inputs_of(image_set, describe_machine(["pycolmap"]), FEATURES, threads)
+    stored = json.loads(record.read_text("utf-8")) if record.is_file() else {}
+    if stored.get("inputs") == inputs:
+        return {name: Cost(**cost) for name, cost in stored["costs"].items()}
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
     database = str(folder / "database.db")
@@ -106,7 +130,8 @@ def colmap_front_end(image_set: ImageSet, folder: Path, threads: int, limit_s: f
         "extract": run_operation("extract", extraction, folder / "extract.log", limit_s),
         "match": run_operation("match", matching, folder / "match.log", limit_s),
     }
-    record.write_text(json.dumps({name: asdict(cost) for name, cost in costs.items()}), "utf-8")
+    content = {"inputs": inputs, "costs": {name: asdict(cost) for name, cost in costs.items()}}
+    record.write_text(json.dumps(content), "utf-8")
     return costs
 
 

@@ -19,24 +19,42 @@ def extract(images: str, database: str, cameras: list[dict[str, Any]], features:
     """SIFT of COLMAP into a new database.
 
     ``cameras`` lists groups of images: names (none for all), mode, and model and params where the
-    intrinsics are known.
+    intrinsics are known. Of several groups COLMAP is told first, so that all images are extracted at once:
+    in a group of one image there is nothing for a second thread.
     """
-    for camera in cameras:
-        reader = pycolmap.ImageReaderOptions()
-        if "params" in camera:
-            reader.camera_model = camera["model"]
-            reader.camera_params = ",".join(repr(value) for value in camera["params"])
-        options = pycolmap.FeatureExtractionOptions()
-        options.use_gpu, options.num_threads = False, threads
-        options.sift.max_num_features = features
+    options = pycolmap.FeatureExtractionOptions()
+    options.use_gpu, options.num_threads = False, threads
+    options.sift.max_num_features = features
+    if len(cameras) == 1:
+        (camera,) = cameras
         pycolmap.extract_features(
             database,
             images,
             image_names=camera["names"],
             camera_mode=getattr(pycolmap.CameraMode, camera["mode"]),
-            reader_options=reader,
+            reader_options=_reader(camera),
             extraction_options=options,
         )
+        return
+    pycolmap.Database.open(database).close()
+    for camera in cameras:
+        pycolmap.import_images(
+            database,
+            images,
+            image_names=camera["names"],
+            camera_mode=getattr(pycolmap.CameraMode, camera["mode"]),
+            options=_reader(camera),
+        )
+    names = [name for camera in cameras for name in camera["names"]]
+    pycolmap.extract_features(database, images, image_names=names, extraction_options=options)
+
+
+def _reader(camera: dict[str, Any]) -> pycolmap.ImageReaderOptions:
+    reader = pycolmap.ImageReaderOptions()
+    if "params" in camera:
+        reader.camera_model = camera["model"]
+        reader.camera_params = ",".join(repr(value) for value in camera["params"])
+    return reader
 
 
 def match(database: str, threads: int) -> None:

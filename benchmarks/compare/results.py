@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.compare.measure import Cost
+from benchmarks.compare.methods import GROUPS, job_counts
 
 OURS = "snakesfm"
 INCREMENTAL = "colmap_incremental"
@@ -15,6 +16,7 @@ METHODS = (OURS, INCREMENTAL, GLOBAL, OPENMVG)
 PEERS = (INCREMENTAL, GLOBAL)
 OWN, SAME = "own", "same"
 SETTINGS = (OWN, SAME)
+PACKAGES = ("snakesfm", "pycolmap", "openmvg-rs", "snakemake", "opencv-python-headless", "poselib", "numpy")
 
 
 @dataclass(frozen=True)
@@ -28,8 +30,10 @@ class Result:
     method, setting, seed : which of METHODS, with its own front-end or on the same features as snakesfm.
     failure : why there is no model; empty where there is one.
     metrics : the project's own evaluation of the model.
-    stages : cost of extract, match, map and total; those that the setting has.
+    stages : cost of extract, match, map and total; those that the setting has. Of snakesfm the first three
+        are what its jobs measured of themselves; see ``share_out``.
     inputs : digest of what the run started from; a result of other inputs is made again.
+    machine : that it was measured on, and the versions; empty where it was stored without.
     """
 
     image_set: str
@@ -42,6 +46,7 @@ class Result:
     inputs: str = ""
     failure: str = ""
     date: str = ""
+    machine: str = ""
     metrics: dict[str, Any] = field(default_factory=dict)
     stages: dict[str, Cost] = field(default_factory=dict)
 
@@ -77,9 +82,31 @@ def read_result(path: Path) -> Result:
     return Result(**content)
 
 
+def share_out(result: Result) -> Result:
+    """Give each group of snakesfm's stages its share of what its run took beside what the jobs measured.
+
+    That is Snakemake, the start of jobs with the import of libraries, and what comes after the model. A
+    peer's cost is that of its whole process, so snakesfm's must hold them too; each job gets as much.
+    """
+    if result.method != OURS or "total" not in result.stages:
+        return result
+    jobs = job_counts(result.images)
+    groups = {name: cost for name, cost in result.stages.items() if name in GROUPS}
+    rest = result.stages["total"].cpu_seconds - sum(cost.cpu_seconds for cost in groups.values())
+    of_a_job = max(rest, 0.0) / sum(jobs.values())
+    shares = {
+        name: replace(cost, cpu_seconds=round(cost.cpu_seconds + of_a_job * jobs[name], 2))
+        for name, cost in groups.items()
+    }
+    return replace(result, stages={**result.stages, **shares})
+
+
 def read_results(folder: Path) -> list[Result]:
-    """All stored results, snakesfm's also as those of the setting SAME, which it shares by definition."""
-    results = [read_result(path) for path in sorted(folder.glob("*.json"))]
+    """All stored results, to be compared: snakesfm's with the costs of :func:`share_out`.
+
+    snakesfm's are also those of the setting SAME, which it shares by definition.
+    """
+    results = [share_out(read_result(path)) for path in sorted(folder.glob("*.json"))]
     shared = [
         replace(result, setting=SAME, stages={k: v for k, v in result.stages.items() if k == "map"})
         for result in results

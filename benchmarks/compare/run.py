@@ -4,22 +4,21 @@ import contextlib
 import hashlib
 import shutil
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
 
-from benchmarks import ROOT
 from benchmarks.compare import methods
+from benchmarks.compare.inputs import source_digest
 from benchmarks.compare.measure import CommandError, Cost
-from benchmarks.compare.results import GLOBAL, INCREMENTAL, OPENMVG, OURS, OWN, SAME, Result
+from benchmarks.compare.results import GLOBAL, INCREMENTAL, OPENMVG, OURS, OWN, PACKAGES, SAME, Result
 from benchmarks.compare.sets import ImageSet
+from benchmarks.machine import describe_machine, today
 from snakesfm.evaluation.scores import score_model
 
 OPERATIONS = {INCREMENTAL: "map_incremental", GLOBAL: "map_global"}
 LARGE_SET = 60
-SOURCES = ("Snakefile", "config.yaml", "scripts", "workflow/rules", "src/snakesfm")
 Costs = dict[str, Cost]
 
 
@@ -91,7 +90,7 @@ class Campaign:
     ) -> None:
         """COLMAP's mappers after its own front-end, which they share."""
         front = work / "colmap"
-        inputs = version("pycolmap")
+        inputs = describe_front_end(len(image_set.camera_groups()))
         runs = [replace(blank, method=m, seed=s, inputs=inputs) for s in seeds for m in peers]
         if all(self.takes_over(result) for result in runs):
             return
@@ -161,7 +160,7 @@ class Campaign:
         """Run, evaluate and store, unless that is stored already; a failure is stored too."""
         if self.takes_over(result):
             return
-        result = replace(result, date=datetime.now(UTC).strftime("%Y-%m-%d"))
+        result = replace(result, date=today(), machine=describe_machine(PACKAGES))
         try:
             result = replace(result, stages=run())
             result = replace(result, metrics=score_model(model, image_set.reference)[0])
@@ -186,15 +185,9 @@ def _report(result: Result) -> Result:
     return result
 
 
-def source_digest() -> str:
-    """Digest of all of snakesfm that decides what the workflow computes."""
-    digest = hashlib.sha256()
-    for file in _source_files():
-        digest.update(file.relative_to(ROOT).as_posix().encode() + b"\0" + file.read_bytes())
-    return digest.hexdigest()
+def describe_front_end(groups: int) -> str:
+    """How COLMAP's features are made: by which version and, of several groups of cameras, all at once.
 
-
-def _source_files() -> Iterator[Path]:
-    for name in SOURCES:
-        path = ROOT / name
-        yield from [path] if path.is_file() else sorted(path.rglob("*.py")) + sorted(path.rglob("*.smk"))
+    The number of groups sets these apart from results whose groups were extracted one after the other.
+    """
+    return version("pycolmap") + (f", {groups} groups of cameras at once" if groups > 1 else "")

@@ -112,33 +112,43 @@ def spread(column: Column, results: Iterable[Result]) -> Spread | None:
 
 def best_peer(
     column: Column, groups: Mapping[Key, list[Result]], image_set: str, setting: str
-) -> float | None:
+) -> Spread | None:
     """The better median of COLMAP's two mappers; None where neither has one or neither end is better."""
     if column.larger_is_better is None:
         return None
-    medians = [
-        found.median
+    found = [
+        one
         for peer in PEERS
-        if (found := spread(column, groups.get((image_set, setting, peer), []))) is not None
+        if (one := spread(column, groups.get((image_set, setting, peer), []))) is not None
     ]
-    if not medians:
+    choose = max if column.larger_is_better else min
+    return choose(found, key=lambda one: one.median, default=None)
+
+
+def ratio(column: Column, ours: Spread | None, peer: Spread | None) -> tuple[float, bool] | None:
+    """How many times better than the peer, above 1 where snakesfm is, and whether either was disturbed.
+
+    None where that cannot be said, and for a wall clock where only one of the two was left alone: that
+    would compare loads.
+    """
+    if ours is None or peer is None:
         return None
-    return max(medians) if column.larger_is_better else min(medians)
-
-
-def ratio(column: Column, ours: float, peer: float) -> float | None:
-    """How many times better than the peer, above 1 where snakesfm is; None where that cannot be said."""
+    if column.timing and "cpu" not in column.key and ours.disturbed != peer.disturbed:
+        return None
     better, worse = (ours, peer) if column.larger_is_better else (peer, ours)
-    return better / worse if worse > 0 else None
+    if worse.median <= 0:
+        return None
+    return better.median / worse.median, ours.disturbed or peer.disturbed
 
 
-def ratios(groups: Mapping[Key, list[Result]], image_set: str, setting: str) -> dict[str, float | None]:
-    """For every column, how many times better snakesfm's median is than the better peer's."""
-    found: dict[str, float | None] = {}
+def ratios(
+    groups: Mapping[Key, list[Result]], image_set: str, setting: str
+) -> dict[str, tuple[float, bool] | None]:
+    """For every column, the ratio of snakesfm's median to the better peer's."""
+    found = {}
     for column in COLUMNS:
         ours = spread(column, groups.get((image_set, setting, OURS), []))
-        peer = best_peer(column, groups, image_set, setting)
-        found[column.key] = None if ours is None or peer is None else ratio(column, ours.median, peer)
+        found[column.key] = ratio(column, ours, best_peer(column, groups, image_set, setting))
     return found
 
 
@@ -147,24 +157,16 @@ def gap(key: str, groups: Mapping[Key, list[Result]], image_set: str, setting: s
     column = next(column for column in COLUMNS if column.key == key)
     ours = spread(column, groups.get((image_set, setting, OURS), []))
     peer = best_peer(column, groups, image_set, setting)
-    return None if ours is None or peer is None else ours.median - peer
+    return None if ours is None or peer is None else ours.median - peer.median
 
 
 def speed(
     key: str, groups: Mapping[Key, list[Result]], image_set: str, setting: str, method: str
 ) -> tuple[float, bool] | None:
-    """How many times faster snakesfm is than ``method`` in a cost, and whether either was disturbed.
-
-    None for the wall clock where only one of the two was left alone: that would compare loads.
-    """
+    """How many times faster snakesfm is than ``method`` in a cost, as :func:`ratio` says it."""
     column = next(column for column in COLUMNS if column.key == key)
     ours = spread(column, groups.get((image_set, setting, OURS), []))
-    other = spread(column, groups.get((image_set, setting, method), []))
-    if ours is None or other is None or ours.median <= 0:
-        return None
-    if ours.disturbed != other.disturbed and "cpu" not in key:
-        return None
-    return other.median / ours.median, ours.disturbed or other.disturbed
+    return ratio(column, ours, spread(column, groups.get((image_set, setting, method), [])))
 
 
 def verdict(difference: float | None, tie: float = TIE) -> str:

@@ -13,10 +13,12 @@ import h5py
 import yaml
 
 from benchmarks import NO_FORKS, ROOT, SOURCES
+from benchmarks.machine import describe_machine, today
 from snakesfm.blocks import choose_blocks
 from snakesfm.job_logs import find_cost
 from snakesfm.simulate import Simulation, SimulationOptions
 
+LIBRARIES = ("snakesfm", "snakemake", "pycolmap", "numpy", "scipy", "h5py", "poselib")
 TILED = ("match_pairs", "estimate_two_view")
 ACCURACY = ("relative_pose_auc_1deg", "relative_pose_auc_5deg", "position_error_percent_median")
 
@@ -53,6 +55,8 @@ class Measurement:
     """Options of the workflow other than the defaults, as ``stage={option: value}``."""
     accuracy: dict[str, float] = field(default_factory=dict)
     stages: dict[str, StageNeed] = field(default_factory=dict)
+    made: str = ""
+    """Date, machine and versions."""
 
     def comparable(self, stage: str) -> bool:
         """Whether a stage ran, and with its defaults."""
@@ -101,6 +105,7 @@ def measure(
     )
     result = collect(options, folder)
     result.config = list(config)
+    result.made = f"{today()}, {describe_machine(LIBRARIES)}"
     return result
 
 

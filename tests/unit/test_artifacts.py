@@ -138,7 +138,7 @@ def test_what_a_killed_writer_left_is_removed_and_a_living_one_is_left_alone(tmp
     assert sorted(tmp_path.iterdir()) == sorted([living, elsewhere, path])
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(
     st.lists(
         st.text(st.characters(exclude_categories=["C", "Zl", "Zp"]), min_size=1, max_size=12), max_size=5

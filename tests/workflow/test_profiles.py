@@ -26,6 +26,13 @@ def test_kubernetes_knows_whose_gpus_the_networks_want(root: Path) -> None:
     assert wanted == dict.fromkeys(STAGES_WITH_NETWORKS, expected)
 
 
+def test_the_image_has_what_the_storage_of_kubernetes_calls(root: Path) -> None:
+    assert read_profile(root, "kubernetes")["default-storage-provider"] == "fs"
+    image = (root / "workflow" / "envs" / "Dockerfile").read_text()
+    assert re.search(r"^RUN .*apt-get install .*\brsync\b", image, re.MULTILINE)
+    assert "pip install --no-cache-dir -c constraints.txt '.[kubernetes]'" in image
+
+
 def test_slurm_is_slurm_gpu_without_gpus(root: Path) -> None:
     plain, gpu = read_profile(root, "slurm"), read_profile(root, "slurm-gpu")
     assert plain.pop("set-resources") == {stage: {"gpu": 0} for stage in STAGES_WITH_NETWORKS}

@@ -18,7 +18,7 @@ import pytest
 from workflow_runner import Workflow, config_of, copy_run, model_bytes
 
 from benchmarks.compare.measure import Cost
-from benchmarks.compare.methods import stage_costs
+from benchmarks.compare.methods import AFTER, GROUPS, job_counts, stage_costs
 from snakesfm.artifacts import LocalFeatures, Reconstruction
 from snakesfm.config.configuration import STAGES
 from snakesfm.start import NO_SERVER, VARIABLE
@@ -313,6 +313,10 @@ def test_logs_say_what_the_jobs_cost(finished) -> None:
         assert 0.0 < costs[name].seconds < 600.0
         assert 0.0 < costs[name].cpu_seconds < 600.0
         assert 20.0 < costs[name].peak_mib < 4000.0
+    stages = [log.parent.name for log in (finished[0] / "logs").glob("*/*.log")]
+    counts = {name: sum(map(stages.count, group)) for name, group in {**GROUPS, "after": AFTER}.items()}
+    assert counts == job_counts(16)
+    assert sum(counts.values()) == len(stages)
 
 
 def test_jobs_are_forked_and_make_the_same_model_as_jobs_of_their_own(

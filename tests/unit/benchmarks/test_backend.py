@@ -140,6 +140,11 @@ def test_positions_are_told_by_family_and_at_a_glance():
         page.index("## Positions at a glance") < page.index("## Rotations") < page.index("## Positions\n")
     )
     assert "## Positions" not in render([ROW])
+    origins = ({"made": "one day, one machine"}, {"made": "another day"}, {})
+    page = render([ROW | origin for origin in origins])
+    head = page[: page.index("Seconds are of")]
+    assert head.count(". Made by\n\n- `python -m benchmarks.backend --seeds 2`\n\n") == 3
+    assert "\n\none day, one machine. Made by\n" in head and "\n\nanother day. Made by\n" in head
 
 
 def test_a_problem_is_saved_with_all_its_arrays(tmp_path):

@@ -1,13 +1,20 @@
 """The comparison's processes: what is measured of them, how they fail, and that COLMAP's mappers run."""
 
+import shutil
 import sys
 from pathlib import Path
 
+import numpy as np
 import pycolmap
 import pytest
+from PIL import Image
 
-from benchmarks.compare.measure import CommandError, run_measured, run_operation
-from benchmarks.compare.methods import colmap_map
+from benchmarks.compare import methods
+from benchmarks.compare.inputs import inputs_of
+from benchmarks.compare.measure import CommandError, Cost, run_measured, run_operation
+from benchmarks.compare.methods import colmap_front_end, colmap_map
+from benchmarks.compare.peers import extract
+from benchmarks.compare.run import describe_front_end
 from benchmarks.compare.sets import ImageSet, read_sets
 from snakesfm.errors import ConfigError
 from snakesfm.evaluation.scores import score_model
@@ -110,6 +117,89 @@ def test_unknown_cameras_are_shared_as_in_the_reference(tmp_path: Path) -> None:
         {"names": names[3:5], "mode": "SINGLE"},
         {"names": names[5:], "mode": "PER_IMAGE"},
     ]
+
+
+def test_inputs_are_a_sets_files_whether_its_intrinsics_are_given_and_what_else_counts(
+    synthetic: Path, tmp_path: Path
+) -> None:
+    copy = tmp_path / "copy"
+    shutil.copytree(synthetic, copy)
+    before = inputs_of(ImageSet(synthetic, True, True), "4.2", 2)
+    assert before == inputs_of(ImageSet(copy, True, True), "4.2", 2)
+    (copy / "images" / "a.jpg").write_bytes(b"x")
+    others = [
+        inputs_of(ImageSet(copy, True, True), "4.2", 2),
+        inputs_of(ImageSet(synthetic, False, True), "4.2", 2),
+        inputs_of(ImageSet(synthetic, True, True), "4.22"),
+        inputs_of(ImageSet(synthetic, True, True), "4.3", 2),
+    ]
+    assert len({before, *others}) == 5
+
+
+def test_a_front_end_is_made_again_where_it_starts_from_something_else(
+    synthetic: Path, tmp_path: Path, monkeypatch
+) -> None:
+    done = []
+
+    def run(operation: str, arguments: dict, log: Path, limit_s: float) -> Cost:
+        done.append(operation)
+        return Cost(float(len(done)), 1.0, 1.0)
+
+    monkeypatch.setattr(methods, "run_operation", run)
+    known, withheld = ImageSet(synthetic, True, True), ImageSet(synthetic, False, True)
+    front = tmp_path / "front"
+    front.mkdir()
+    # one that was stored without what it started from
+    (front / "cost.json").write_text('{"extract": {"seconds": 9, "cpu_seconds": 9, "peak_mib": 9}}')
+    for image_set, threads, runs in ((known, 2, 1), (known, 2, 1), (withheld, 2, 2), (withheld, 1, 3)):
+        costs = colmap_front_end(image_set, front, threads, 60.0)
+        assert done == ["extract", "match"] * runs
+        assert [costs[name].seconds for name in ("extract", "match")] == [2 * runs - 1, 2 * runs]
+
+
+def extracted(images: Path, database: Path, groups: list[dict]) -> list[tuple[int, str, float]]:
+    """Camera's number, model and focal length of each image in the database, by name; all have keypoints."""
+    extract(str(images), str(database), groups, 50, 1)
+    with pycolmap.Database.open(database) as opened:
+        cameras = {camera.camera_id: camera for camera in opened.read_all_cameras()}
+        found = sorted(opened.read_all_images(), key=lambda image: image.name)
+        assert all(opened.num_keypoints_for_image(image.image_id) > 0 for image in found)
+    assert [image.name for image in found] == sorted(path.name for path in images.iterdir())
+    taken = [cameras[image.camera_id] for image in found]
+    return [(camera.camera_id, camera.model_name, camera.params[0]) for camera in taken]
+
+
+def test_groups_of_cameras_are_extracted_at_once_and_keep_their_cameras(
+    tmp_path: Path, monkeypatch
+) -> None:
+    images = tmp_path / "images"
+    images.mkdir()
+    names = [f"{k}.png" for k in range(4)]
+    rng = np.random.default_rng(0)
+    for name in names:
+        noise = Image.fromarray(rng.integers(0, 256, (12, 16), np.uint8))
+        noise.resize((160, 120), Image.Resampling.BICUBIC).save(images / name)
+    calls = []
+    real = pycolmap.extract_features
+    monkeypatch.setattr(pycolmap, "extract_features", lambda *a, **k: (calls.append(k), real(*a, **k)))
+    shared, single = (
+        {"mode": "SINGLE", "model": "SIMPLE_PINHOLE", "params": [focal, 80.0, 60.0]}
+        for focal in (150.25, 99.5)
+    )
+    groups = [{"names": names[1:3], **shared}, {"names": names[:1], **single}]
+    groups.append({"names": names[3:], "mode": "PER_IMAGE"})
+    first, *middle, last = extracted(images, tmp_path / "several.db", groups)
+    assert first[1:] == ("SIMPLE_PINHOLE", 99.5)
+    assert middle == [(middle[0][0], "SIMPLE_PINHOLE", 150.25)] * 2
+    assert last[1] == "SIMPLE_RADIAL" and len({first[0], middle[0][0], last[0]}) == 3
+    one = extracted(images, tmp_path / "one.db", [{"names": [], **shared}])
+    assert one == [(one[0][0], "SIMPLE_PINHOLE", 150.25)] * 4
+    assert len(calls) == 2
+
+
+def test_results_of_groups_that_were_extracted_one_after_the_other_are_made_again() -> None:
+    assert describe_front_end(1) == pycolmap.__version__
+    assert describe_front_end(10) == f"{pycolmap.__version__}, 10 groups of cameras at once"
 
 
 @pytest.mark.parametrize(

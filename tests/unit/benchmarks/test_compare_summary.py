@@ -2,18 +2,30 @@
 
 import csv
 import io
+import json
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
+from benchmarks.compare.__main__ import add_command, write_tables
 from benchmarks.compare.ablate import DEFAULT, read_ablations, render_ablations
 from benchmarks.compare.measure import Cost
-from benchmarks.compare.methods import stage_costs
-from benchmarks.compare.results import GLOBAL, INCREMENTAL, OURS, OWN, SAME, Result, read_results
+from benchmarks.compare.methods import job_counts, stage_costs
+from benchmarks.compare.results import (
+    GLOBAL,
+    INCREMENTAL,
+    OURS,
+    OWN,
+    PACKAGES,
+    SAME,
+    Result,
+    read_results,
+)
 from benchmarks.compare.run import Campaign
 from benchmarks.compare.summary import COLUMNS, best_peer, gap, group, ratios, speed, spread, tally
 from benchmarks.compare.tables import render_csv, render_page
+from benchmarks.machine import describe_machine
 from snakesfm.errors import ConfigError
 
 AREA = "relative_pose_auc_1deg"
@@ -56,12 +68,13 @@ def test_ratios_are_to_the_better_peer_and_above_one_where_snakesfm_is_better(
     results: list[Result],
 ) -> None:
     groups = group(results)
-    assert best_peer(column(AREA), groups, "castle", OWN) == 88.0
-    assert best_peer(column("total_seconds"), groups, "castle", OWN) == 10.0
+    assert best_peer(column(AREA), groups, "castle", OWN).median == 88.0
+    assert best_peer(column("total_seconds"), groups, "castle", OWN).median == 10.0
+    assert best_peer(column(AREA), groups, "castle", SAME) is None
     found = ratios(groups, "castle", OWN)
-    assert found[AREA] == pytest.approx(91.0 / 88.0)
-    assert found["total_seconds"] == pytest.approx(2.5)
-    assert found["position_error_median"] == pytest.approx(2.5)
+    assert found[AREA] == (pytest.approx(91.0 / 88.0), False)
+    assert found["total_seconds"] == (pytest.approx(2.5), False)
+    assert found["position_error_median"] == (pytest.approx(2.5), False)
     assert found["points"] is None
     assert gap(AREA, groups, "castle", OWN) == pytest.approx(3.0)
     assert gap(AREA, groups, "castle", SAME) is None
@@ -79,6 +92,14 @@ def test_disturbed_timings_count_only_where_there_are_no_others() -> None:
     groups = group([calm, result(INCREMENTAL, 0, 80.0, 16.0, others=0.5)])
     assert speed("total_seconds", groups, "castle", OWN, INCREMENTAL) is None
     assert speed("total_cpu_seconds", groups, "castle", OWN, INCREMENTAL) == (8.0, True)
+    found = ratios(groups, "castle", OWN)
+    assert (found["total_seconds"], found["total_cpu_seconds"]) == (None, (8.0, True))
+    assert found[AREA] == (pytest.approx(90.0 / 80.0), False)
+    groups = group([loud, result(INCREMENTAL, 0, 80.0, 18.0, others=0.5)])
+    assert ratios(groups, "castle", OWN)["total_seconds"] == (2.0, True)
+    assert "| *ratio* | ~2 | ~2 | ~2 | ~2 | ~2 | ~2 | 0.99 |" in render_page(
+        [*groups["castle", OWN, OURS], *groups["castle", OWN, INCREMENTAL]], "", ["compare"]
+    )
 
 
 def test_what_was_disturbed_is_measured_again_where_that_is_asked_for(tmp_path: Path) -> None:
@@ -111,11 +132,35 @@ def test_snakesfm_takes_part_on_the_same_features_with_its_mapping(
     assert all(set(item.stages) == {"map"} for item in shared)
 
 
+def test_what_a_run_takes_beside_its_jobs_is_shared_out_among_them(tmp_path: Path) -> None:
+    # 12 images: 2 blocks, 3 tiles; 21 jobs
+    assert job_counts(12) == {"extract": 4, "match": 7, "map": 7, "after": 3}
+    assert job_counts(200) == {"extract": 6, "match": 21, "map": 7, "after": 3}
+    measured = {"extract": 5.0, "match": 2.0, "map": 0.5, "total": 9.6}
+    stages = {name: Cost(1.0, seconds, 10.0) for name, seconds in measured.items()}
+    ours = replace(BLANK, images=12, stages=stages)
+    peer = replace(ours, method=GLOBAL)
+    failed = replace(ours, seed=1, failure="stopped", stages={"failed": Cost(1.0, 2.0, 3.0)})
+    for item in (ours, peer, failed):
+        item.write(tmp_path)
+    assert ours.stored(tmp_path) == ours
+    read = {(item.method, item.setting, item.seed): item.stages for item in read_results(tmp_path)}
+    shared = {name: cost.cpu_seconds for name, cost in read[OURS, OWN, 0].items()}
+    assert shared == {"extract": 5.4, "match": 2.7, "map": 1.2, "total": 9.6}
+    assert read[OURS, OWN, 0]["map"].seconds == 1.0
+    assert read[OURS, SAME, 0] == {"map": read[OURS, OWN, 0]["map"]}
+    assert (read[GLOBAL, OWN, 0], read[OURS, OWN, 1]) == (peer.stages, failed.stages)
+    # rounding can make the parts more than the whole
+    stages["total"] = Cost(1.0, 7.0, 10.0)
+    replace(ours, stages=stages).write(tmp_path)
+    assert {item.stages["map"].cpu_seconds for item in read_results(tmp_path) if item.seed == 0} == {0.5}
+
+
 def test_page_and_csv_hold_what_was_measured(results: list[Result]) -> None:
     shared = [replace(item, setting=SAME) for item in results if item.method == OURS]
     peers = [result(GLOBAL, seed, 93.0, 1.0, SAME) for seed in range(3)]
-    page = render_page([*results, *shared, *peers], {"cores": "2"}, "compare --seeds 3")
-    assert "Measured 2026-01-02 with `compare --seeds 3`\non cores 2." in page
+    page = render_page([*results, *shared, *peers], "cores 2", ["compare --seeds 3"])
+    assert "Measured 2026-01-02 with `compare --seeds 3`\non cores 2.\n\n" in page
     rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in page.splitlines()]
     (gaps,) = [cells for cells in rows if cells[:1] == ["castle*"]]
     assert (gaps[1], gaps[4], gaps[5]) == ("+3.00", "+0", "-2.00")
@@ -132,6 +177,30 @@ def test_page_and_csv_hold_what_was_measured(results: list[Result]) -> None:
     assert len(runs) == len(results)
     assert {row["failure"] for row in runs} == {"", "crashed by SIGSEGV"}
     assert float(runs[0][AREA]) == 90.0
+
+
+def test_the_page_names_the_machines_and_commands_of_the_results_not_of_who_renders_them(
+    tmp_path: Path, results: list[Result]
+) -> None:
+    ours, other = results[0], replace(results[3], image_set="door", date="2026-01-05")
+    ours.write(tmp_path / "results")
+    # as those were stored that had no machine
+    file = ours.path(tmp_path / "results")
+    stored = json.loads(file.read_text())
+    del stored["machine"]
+    file.write_text(json.dumps(stored))
+    for command in ("compare --sets castle", "compare --sets door", "compare --sets castle"):
+        add_command(tmp_path, command)
+    write_tables(tmp_path, None)
+    here = describe_machine(PACKAGES)
+    commands = "`compare --sets castle`, `compare --sets door`"
+    page = (tmp_path / "benchmarks.md").read_text()
+    assert f"Measured 2026-01-02 with {commands}\non {here}.\n\n" in page
+    replace(other, machine="cores 64").write(tmp_path / "results")
+    write_tables(tmp_path, tmp_path / "own.md")
+    page = (tmp_path / "own.md").read_text()
+    assert f"Measured 2026-01-02 to 2026-01-05 with {commands}\n" in page
+    assert f"\n\n- {here}: castle\n- cores 64: door\n\n" in page
 
 
 def test_stage_costs_are_read_from_the_last_run_in_the_logs(tmp_path: Path) -> None:

@@ -68,8 +68,16 @@ def test_what_is_there_is_not_measured_again(tmp_path: Path, capsys: pytest.Capt
     broken[0] = False
     assert table.main([*command, "--sets", "two"]) == 0
     assert measured[4:] == [("two", "y", options, 1)]
-    values, sets, methods = json.loads((tmp_path / "out" / "mine.md").read_text())
+    shown, _, said = (tmp_path / "out" / "mine.md").read_text().partition("\n")
+    values, sets, methods = json.loads(shown)
+    assert said == "Options of the workflow: `seed=1`, all others default.\n"
     assert (sets, methods) == (["two"], ["x", "y"]) and not page.exists()
-    assert values["two|y"] == {"found": 5} and values["one|y"] == {"failure": "broken"}
+    assert values["two|y"].pop("inputs") and values["two|y"] == {"found": 5}
+    assert values["one|y"].pop("inputs") and values["one|y"] == {"failure": "broken"}
+    # what was measured with other options is another result
+    del measured[:]
+    assert table.main([*command[:-2], "--sets", "two"]) == 0
+    assert [options for _, _, options, _ in measured] == [(f"weights={tmp_path}",)] * 2
+    assert (tmp_path / "out" / "mine.md").read_text().endswith("Options of the workflow: default.\n")
     assert table.main([*command, "--sets", "three"]) == 1
     assert "is not an image set" in capsys.readouterr().err

@@ -6,12 +6,13 @@ from pathlib import Path
 import pandas
 import pytest
 
-from benchmarks.compare.results import GLOBAL, INCREMENTAL, OURS, OWN
+from benchmarks.compare.results import GLOBAL, INCREMENTAL, OPENMVG, OURS, OWN
 
 ROOT = Path(__file__).resolve().parents[3]
 PAGES = "\n".join(
     (ROOT / name).read_text(encoding="utf-8") for name in ("README.md", "docs/benchmarks_overview.md")
 )
+TEXT = " ".join(PAGES.split())
 METHODS = [OURS, INCREMENTAL, GLOBAL]
 SETS = {
     "Vesta": "astrovision_vesta_4",
@@ -57,8 +58,7 @@ def test_accuracy_and_time_with_independent_references(name):
 
 
 def test_total_seconds_of_the_large_sets():
-    text = PAGES.replace("\n", " ")
-    found = re.findall(r"\(([^()]+)\) (\d+) / (\d+) / (\d+)", text)
+    found = re.findall(r"\(([^()]+)\) (\d+) / (\d+) / (\d+)", TEXT)
     assert len(found) == 3
     for name, *seconds in found:
         measured = medians("benchmarks", SETS[name])
@@ -67,7 +67,7 @@ def test_total_seconds_of_the_large_sets():
 
 
 def test_photographs_of_full_resolution():
-    methods = [*METHODS, "openmvg_global"]
+    methods = [*METHODS, OPENMVG]
     measured = medians("benchmarks_large", "courtyard_4000")
     for start, column, step in (
         ("total seconds", "total_seconds", 1),
@@ -93,3 +93,41 @@ def test_photographs_that_overlap_little(label, image_set):
             assert float(area) == pytest.approx(
                 measured[f"relative_pose_auc_{degrees}deg"][method], abs=0.51
             )
+
+
+def test_openmvg_is_faster_and_less_accurate():
+    assert "takes less than three quarters of snakesfm's time on these sets" in TEXT
+    small, large = re.search(r"by less than 2 on (.+?), by more than 25 on (.+?)\. ", TEXT).groups()
+    lacks = {}
+    for name in list(SETS)[:9]:
+        measured = medians("benchmarks", SETS[name])
+        assert measured.total_seconds[OPENMVG] < 0.75 * measured.total_seconds[OURS]
+        areas = measured.relative_pose_auc_1deg
+        lacks[name] = areas[OURS] - areas[OPENMVG]
+    assert min(lacks.values()) > 0
+    near, far = (set(re.split(", | and the | and ", names)) for names in (small, large))
+    assert {name for name, lack in lacks.items() if lack < 2} == near
+    assert {name for name, lack in lacks.items() if lack > 25} == far
+    every = pandas.read_csv(ROOT / "docs" / "benchmarks.csv").image_set.unique()
+    models = []
+    for image_set in every:
+        measured = medians("benchmarks", image_set)
+        if OPENMVG in measured.index and measured.registered_images[OPENMVG] > 0:
+            models.append(image_set)
+            assert measured.total_seconds[OPENMVG] < measured.total_seconds[OURS]
+            assert measured.relative_pose_auc_1deg[OPENMVG] < measured.relative_pose_auc_1deg[OURS]
+    assert len(models) > 5 and SETS["Statue of Liberty"] not in models
+
+
+def test_where_photographs_overlap_little_the_overview_has_the_tallies_of_the_page():
+    shown = re.search(
+        r"of the (\d+) on that page snakesfm is better at 1 degree on (\d+), equal \(within 0\.1\) on (\d+) and worse on "
+        r"(\d+); with independent references better on (\d+), equal on (\d+) and worse on (\d+)\.",
+        TEXT,
+    ).groups()
+    page = (ROOT / "docs" / "benchmarks_thinned.md").read_text(encoding="utf-8")
+    tallies = [
+        re.search(rf"\(a\) own front-end, {label}: .*?@1 (\d+) / (\d+) / (\d+)", page).groups()
+        for label in ("all sets", "independent references")
+    ]
+    assert shown == (str(sum(map(int, tallies[0]))), *tallies[0], *tallies[1])

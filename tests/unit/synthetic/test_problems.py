@@ -99,7 +99,7 @@ def test_tiny_problems(cameras, points):
     assert len(problem.keypoints) == cameras
 
 
-def test_two_hundred_cameras_take_about_a_second():
+def test_two_hundred_cameras_take_seconds_even_on_a_slow_machine():
     start = time.process_time()
     make_problem(200, 8000, "street")
-    assert time.process_time() - start < 3.0
+    assert time.process_time() - start < 10.0
