@@ -70,8 +70,8 @@ NEEDS = {
     "match_pairs": Need("tile", 400, 0.02, 0.03, pair_s=0.12),
     "merge_keypoints": Need("block", 600, 2.0, 0.1, image_s=1.0),
     "index_matches": Need("tile", 500, 2.0, 0.1, pair_s=0.1),
-    # 40 kB for each of ten pairs per image, where every image has a camera of its own
-    "calibrate_cameras": Need("scene", 500, 0.6, 0.0005, image_s=0.12),
+    # where images have cameras of their own: 40 kB for each of ten pairs, and a provisional model
+    "calibrate_cameras": Need("scene", 500, 2.0, 0.0005, image_s=0.5),
     "estimate_two_view": Need("tile", 500, 0.2, 0.03, pair_s=0.12),
     "build_view_graph": Need("scene", 300, 0.01, 0.002, image_s=0.06),
     "filter_view_graph": Need("scene", 800, 0.02, 0.002, image_s=0.12),

@@ -13,7 +13,7 @@ from typing import Any
 
 from snakesfm.blocks import choose_blocks, tile_names
 from snakesfm.config.base import StageOptions
-from snakesfm.config.configuration import STAGES, SceneInputs
+from snakesfm.config.configuration import STAGES, SceneInputs, options_class
 from snakesfm.config.select_pairs import SelectPairsOptions
 from snakesfm.digests import file_digest, file_state, model_digest, options_digest, settings_text
 from snakesfm.front_ends import (
@@ -52,6 +52,7 @@ STAGES_IN_DETECTOR_PIXELS = (
     "triangulate_tracks",
     "adjust_bundle",
 )
+PROVISIONAL_STAGES = STAGES[STAGES.index("estimate_two_view") : STAGES.index("adjust_bundle") + 1]
 IMAGE_LISTS = ("images.txt", "images.bin")
 """Beside known cameras: which image is of which."""
 STAGES_WITH_NETWORKS = ("extract_features", "describe_images", "match_pairs")
@@ -354,6 +355,9 @@ class ScenePlan:
                 "pairs_file": self.pairs_file,
                 "pairs_content": pair_list_state(self.pairs_file),
             }
+        if stage == "calibrate_cameras":
+            # what makes its provisional model
+            return {"versions": {name: options_class(name).stage_version for name in PROVISIONAL_STAGES}}
         if stage == "adjust_bundle":
             model = self.configuration.index_images.camera_model
             return {"images": str(self.images), "intrinsics": inputs.intrinsics, "camera_model": model}

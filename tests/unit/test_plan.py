@@ -15,6 +15,7 @@ from snakesfm.plan import Plan
 from snakesfm.records import split_words
 from snakesfm.rule_inputs import global_descriptors, previewed_features
 from snakesfm.rule_settings import check_named_together
+from snakesfm.scene_plan import PROVISIONAL_STAGES
 from snakesfm.seeding import derive_seed
 
 
@@ -335,7 +336,9 @@ def test_another_version_of_a_stage_changes_what_it_is_told(
     before = params_of(config)
     monkeypatch.setattr(options_class(stage), "stage_version", 999)
     after = params_of(config)
-    assert {other for other in STAGES if before[other] != after[other]} == {stage}
+    # the provisional model is made by others' code
+    calibration = {"calibrate_cameras"} if stage in PROVISIONAL_STAGES else set()
+    assert {other for other in STAGES if before[other] != after[other]} == {stage} | calibration
 
 
 def test_settings_of_another_seed_are_others() -> None:

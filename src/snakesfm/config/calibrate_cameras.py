@@ -1,6 +1,6 @@
 """Options of calibrate_cameras."""
 
-from typing import ClassVar, Self
+from typing import ClassVar, Literal, Self
 
 from pydantic import Field, model_validator
 
@@ -10,7 +10,7 @@ from snakesfm.config.base import StageOptions
 class CalibrateCamerasOptions(StageOptions):
     """How unknown focal lengths are estimated before any pose is known."""
 
-    stage_version: ClassVar[int] = 7
+    stage_version: ClassVar[int] = 8
 
     estimate_focals: bool = True
     """Estimate unknown focal lengths from fundamental matrices; otherwise the priors are kept."""
@@ -47,6 +47,17 @@ class CalibrateCamerasOptions(StageOptions):
 
     default_sigma: float = Field(default=0.5, gt=0, le=10)
     """Relative standard deviation of the default focal length, as a prior."""
+
+    provisional_model: Literal["auto"] | bool = "auto"
+    """Check the focal lengths with a quick model of the strongest pairs, and use its cameras if they
+    differ; 'auto' does so if most images have a camera of their own."""
+
+    provisional_pairs: int = Field(default=6, ge=2, le=1000)
+    """Largest number of image pairs per camera in the provisional model."""
+
+    min_revision_sigmas: float = Field(default=2.0, ge=0, le=100)
+    """The cameras of the provisional model are used if its focal lengths differ by more than this many
+    standard deviations of the estimates, in the median."""
 
     overlay_share: float = Field(default=0.3, ge=0, le=1)
     """Matches that do not move are left out where this share of the pairs has such: a time stamp, a logo, a

@@ -1,6 +1,8 @@
 """Stage calibrate_cameras: unknown focal lengths from the matches."""
 
+import math
 from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import replace
 from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -11,6 +13,7 @@ from snakesfm.arrays import Array
 from snakesfm.artifacts.gather import gather_keypoints
 from snakesfm.artifacts.images import CalibratedCameras, ImageIndex
 from snakesfm.artifacts.pairs import PairMatches
+from snakesfm.errors import SceneError
 from snakesfm.geometry.camera import Camera, cameras_from_columns, cameras_to_columns
 from snakesfm.geometry.detector_pixels import (
     detector_scales,
@@ -19,6 +22,7 @@ from snakesfm.geometry.detector_pixels import (
     reduce_keypoints,
     restore_cameras,
 )
+from snakesfm.grouping import offsets_of
 from snakesfm.matching.overlays import cover_images, find_moving_matches, find_overlay_cells
 from snakesfm.stages.job import StageJob
 
@@ -59,18 +63,9 @@ def run(job: StageJob) -> None:
     covered = cover_images(cells)
     if options.estimate_focals and not given.all():
         cameras, sigmas, counts = _calibrate(job, index, cameras, matched, covered)
+        cameras = _revised(job, index, cameras, sigmas, counts, cells, matched)
     warnings = [OVERLAY.format(percent=100 * grid.mean()) for grid in covered.values()]
-    models, sizes, params, sources = cameras_to_columns(cameras)
-    CalibratedCameras(
-        np.array(models, dtype=object),
-        sizes,
-        params,
-        np.array(sources, dtype=object),
-        sigmas,
-        counts,
-        cells,
-        np.array(warnings, dtype=object),
-    ).write(job.output, job.header)
+    _artifact(cameras, sigmas, counts, cells, warnings).write(job.output, job.header)
     for line in warnings:
         print(f"warning: {line}", flush=True)
     print(_summary(cameras), flush=True)
@@ -115,6 +110,75 @@ def _calibrate(
     return restore_cameras(result.cameras, cameras, job.settings), result.sigmas, result.pair_counts
 
 
+def _revised(
+    job: StageJob,
+    index: ImageIndex,
+    cameras: list[Camera],
+    sigmas: Array,
+    counts: Array,
+    cells: Array,
+    matched: "_MatchedImages",
+) -> list[Camera]:
+    """The cameras as a provisional model has them, if its focal lengths are others."""
+    # most scenes need none of it
+    from snakesfm.bundle.keypoint_refinement import most_share_a_camera
+    from snakesfm.calibration.focal import choose_pairs
+    from snakesfm.provisional_model import make_provisional_model
+
+    options: CalibrateCamerasOptions = job.options
+    wanted = options.provisional_model
+    if not (wanted if wanted != "auto" else not most_share_a_camera(index.camera_ids)):
+        return cameras
+    free = np.array([camera.source != "given" for camera in cameras], dtype=bool)
+    chosen = choose_pairs(
+        matched.pairs,
+        matched.counts,
+        index.camera_ids,
+        free,
+        options.provisional_pairs,
+        options.min_matches,
+    )
+    try:
+        model = make_provisional_model(
+            job, _artifact(cameras, sigmas, counts, cells, []), matched.deal(chosen, job.threads)
+        )
+    except SceneError as error:
+        print(f"no provisional model: {error}", flush=True)
+        return cameras
+    adjusted = cameras_from_columns(model.camera_models, model.camera_sizes, model.camera_params)
+    posed = np.isin(np.arange(len(cameras)), index.camera_ids[model.models >= 0])
+    rows = np.flatnonzero(free & posed & (model.camera_resets == "")).tolist()
+    changes = [abs(math.log(adjusted[row].focal_px / cameras[row].focal_px)) for row in rows]
+    deviations = np.where(np.isnan(sigmas), options.default_sigma, sigmas)[rows]
+    change = float(np.median(changes / deviations)) if rows else 0.0
+    used = change > options.min_revision_sigmas
+    print(
+        f"the provisional model changes {len(rows)} focal lengths by {change:.2f} standard deviations in "
+        f"the median: its cameras are {'used' if used else 'not needed'}",
+        flush=True,
+    )
+    if not used:
+        return cameras
+    revised = {row: replace(adjusted[row], source="estimated") for row in rows}
+    return [revised.get(row, camera) for row, camera in enumerate(cameras)]
+
+
+def _artifact(
+    cameras: list[Camera], sigmas: Array, counts: Array, cells: Array, warnings: list[str]
+) -> CalibratedCameras:
+    models, sizes, params, sources = cameras_to_columns(cameras)
+    return CalibratedCameras(
+        np.array(models, dtype=object),
+        sizes,
+        params,
+        np.array(sources, dtype=object),
+        sigmas,
+        counts,
+        cells,
+        np.array(warnings, dtype=object),
+    )
+
+
 class _MatchedImages:
     """The matches of all pairs, read where they are asked for; the keypoints that these need are kept.
 
@@ -149,6 +213,27 @@ class _MatchedImages:
                     order = np.argsort(-scores[part], kind="stable")
                     matches = columns[part][order]
                     yield row, self._keypoints[i][matches[:, 0]], self._keypoints[j][matches[:, 1]]
+
+    def deal(self, rows: Array, count: int) -> list[PairMatches]:
+        """Some rows in so many artifacts."""
+        return [self._select(rows[part::count]) for part in range(min(count, len(rows)))]
+
+    def _select(self, rows: Array) -> PairMatches:
+        parts: dict[int, tuple[Array, Array]] = {}
+        by_file = sorted(rows.tolist(), key=self._places.__getitem__)
+        for path, of_file in groupby(by_file, key=lambda row: self._places[row][0]):
+            with PairMatches.open(path) as file:
+                for row in of_file:
+                    part = slice(*self._places[row][1:])
+                    parts[row] = file["matches"][part], file["scores"][part]
+        ordered = [parts[row] for row in sorted(parts)]
+        return PairMatches(
+            self.pairs[sorted(parts)].astype(np.int32),
+            np.full(len(parts), "", dtype=object),
+            offsets_of([len(scores) for _, scores in ordered]),
+            np.concatenate([np.zeros((0, 2), np.int32), *(matches for matches, _ in ordered)]),
+            np.concatenate([np.zeros(0, np.float32), *(scores for _, scores in ordered)]),
+        )
 
     def of_one_size(self, most: int) -> Iterator[tuple[tuple[int, int], Array, Array]]:
         """Up to so many pairs of images of one size, evenly drawn: the size and the keypoints."""
