@@ -265,7 +265,7 @@ def write_former_stages(folder: Path, problem: SyntheticProblem) -> dict[str, ob
     CameraRotations(
         rotations=rotations,
         residuals_deg=np.full(kept.sum(), 0.25),
-        labels=np.zeros(kept.sum(), np.int8),
+        labels=np.where(np.arange(kept.sum()) == 0, 2, 0),
         components=np.where(np.arange(COUNT) == LOST, -1, 0),
     ).write(folder / "rotations.h5", HEADER)
     keypoints = problem.track_keypoints

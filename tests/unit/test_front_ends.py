@@ -217,11 +217,12 @@ def test_imported_matches_without_a_list_are_the_list(tmp_path: Path) -> None:
 
 
 def test_without_keypoints_the_stages_after_matching_read_merged_ones(tmp_path: Path) -> None:
-    plan = plan_of(tmp_path, front_end="loftr", weights=str(tmp_path / "w"), device="cpu")
+    given = {"front_end": "loftr", "weights": str(tmp_path / "w")}
+    (scene,) = plan_of(tmp_path, **given).scenes.values()
+    assert scene.gpus("match_pairs") == 1 and scene.gpus("extract_features") == 0
+    plan = plan_of(tmp_path, **given, device="cpu")
     (scene,) = plan.scenes.values()
-    assert (
-        plan.models == ["loftr"] and scene.gpus("match_pairs") == 1 and scene.gpus("extract_features") == 0
-    )
+    assert plan.models == ["loftr"] and scene.gpus("match_pairs") == 0
     assert scene.features_stage == "merge_keypoints" and scene.matches_stage == "index_matches"
     assert not any("extract_features" in file for file in scene.all_files())
     assert [Path(file).stem for file in block_tiles(scene, "0")] == ["0-0", "0-1"]

@@ -123,7 +123,7 @@ def _revised(
     # most scenes need none of it
     from snakesfm.bundle.keypoint_refinement import most_share_a_camera
     from snakesfm.calibration.focal import choose_pairs
-    from snakesfm.provisional_model import make_provisional_model
+    from snakesfm.stages.provisional_model import make_provisional_model
 
     options: CalibrateCamerasOptions = job.options
     wanted = options.provisional_model

@@ -9,10 +9,10 @@ from synthetic_scene import HEADER, write_scene
 from snakesfm.artifacts import CalibratedCameras, PairMatches
 from snakesfm.config.calibrate_cameras import CalibrateCamerasOptions
 from snakesfm.config.configuration import STAGES
-from snakesfm.provisional_model import STEPS
 from snakesfm.scene_plan import PROVISIONAL_STAGES
 from snakesfm.stages import calibrate_cameras
 from snakesfm.stages.job import StageJob
+from snakesfm.stages.provisional_model import STEPS
 from snakesfm.synthetic.problems import make_problem
 
 COUNT = 12
