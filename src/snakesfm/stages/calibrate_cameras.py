@@ -30,6 +30,8 @@ if TYPE_CHECKING:
     from snakesfm.config.calibrate_cameras import CalibrateCamerasOptions
 
 GIVEN_SIGMA = 0.0
+# a model of fewer hardly tells focal lengths and distortion apart
+LEAST_IMAGES = 5
 # more pairs show no other overlay, and cost time
 OVERLAY_PAIRS = 3000
 OVERLAY = (
@@ -127,7 +129,9 @@ def _revised(
 
     options: CalibrateCamerasOptions = job.options
     wanted = options.provisional_model
-    if not (wanted if wanted != "auto" else not most_share_a_camera(index.camera_ids)):
+    if wanted == "auto":
+        wanted = len(index.names) >= LEAST_IMAGES and not most_share_a_camera(index.camera_ids)
+    if not wanted:
         return cameras
     free = np.array([camera.source != "given" for camera in cameras], dtype=bool)
     chosen = choose_pairs(
@@ -202,30 +206,18 @@ class _MatchedImages:
         found, _ = gather_keypoints(self._features, wanted, self._names)
         for image, points in found.items():
             self._keypoints[image] = reduce_keypoints(points, self._scales[image])
-        by_file = sorted(rows.tolist(), key=self._places.__getitem__)
-        for path, of_file in groupby(by_file, key=lambda row: self._places[row][0]):
-            with PairMatches.open(path) as file:
-                columns, scores = file["matches"], file["scores"]
-                for row in of_file:
-                    i, j = self.pairs[row].tolist()
-                    part = slice(*self._places[row][1:])
-                    # best first: the estimator draws from the first ones sooner
-                    order = np.argsort(-scores[part], kind="stable")
-                    matches = columns[part][order]
-                    yield row, self._keypoints[i][matches[:, 0]], self._keypoints[j][matches[:, 1]]
+        for row, matches, scores in self._parts(rows):
+            i, j = self.pairs[row].tolist()
+            # best first: the estimator draws from the first ones sooner
+            best = matches[np.argsort(-scores, kind="stable")]
+            yield row, self._keypoints[i][best[:, 0]], self._keypoints[j][best[:, 1]]
 
     def deal(self, rows: Array, count: int) -> list[PairMatches]:
         """Some rows in so many artifacts."""
         return [self._select(rows[part::count]) for part in range(min(count, len(rows)))]
 
     def _select(self, rows: Array) -> PairMatches:
-        parts: dict[int, tuple[Array, Array]] = {}
-        by_file = sorted(rows.tolist(), key=self._places.__getitem__)
-        for path, of_file in groupby(by_file, key=lambda row: self._places[row][0]):
-            with PairMatches.open(path) as file:
-                for row in of_file:
-                    part = slice(*self._places[row][1:])
-                    parts[row] = file["matches"][part], file["scores"][part]
+        parts = {row: (matches, scores) for row, matches, scores in self._parts(rows)}
         ordered = [parts[row] for row in sorted(parts)]
         return PairMatches(
             self.pairs[sorted(parts)].astype(np.int32),
@@ -234,6 +226,15 @@ class _MatchedImages:
             np.concatenate([np.zeros((0, 2), np.int32), *(matches for matches, _ in ordered)]),
             np.concatenate([np.zeros(0, np.float32), *(scores for _, scores in ordered)]),
         )
+
+    def _parts(self, rows: Array) -> Iterator[tuple[int, Array, Array]]:
+        """Some rows, file by file, their matches (K,2) and scores (K,)."""
+        by_file = sorted(rows.tolist(), key=self._places.__getitem__)
+        for path, of_file in groupby(by_file, key=lambda row: self._places[row][0]):
+            with PairMatches.open(path) as file:
+                for row in of_file:
+                    part = slice(*self._places[row][1:])
+                    yield row, file["matches"][part], file["scores"][part]
 
     def of_one_size(self, most: int) -> Iterator[tuple[tuple[int, int], Array, Array]]:
         """Up to so many pairs of images of one size, evenly drawn: the size and the keypoints."""
