@@ -3,7 +3,7 @@
 import shutil
 from typing import Any
 
-DRIVER_TOOLS = ("nvidia-smi", "rocm-smi")
+DRIVER_TOOL = "nvidia-smi"
 
 
 def limit_gpu_jobs(scheduler: Any) -> None:
@@ -16,5 +16,5 @@ def limit_gpu_jobs(scheduler: Any) -> None:
     ----------
     scheduler : Snakemake's (9.27), of a run on one machine, before it starts jobs.
     """
-    if "gpu" not in scheduler.global_resources and any(map(shutil.which, DRIVER_TOOLS)):
+    if "gpu" not in scheduler.global_resources and shutil.which(DRIVER_TOOL):
         scheduler.global_resources["gpu"] = scheduler.resources["gpu"] = 1

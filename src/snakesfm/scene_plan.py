@@ -357,7 +357,13 @@ class ScenePlan:
             }
         if stage == "calibrate_cameras":
             # what makes its provisional model
-            return {"versions": {name: options_class(name).stage_version for name in PROVISIONAL_STAGES}}
+            makers = {name: options_class(name) for name in PROVISIONAL_STAGES}
+            digests = {
+                name: options_digest(maker.stage_version, maker().canonical_json())
+                for name, maker in makers.items()
+            }
+            distorts = self.configuration.adjust_bundle.refine_distortion
+            return {"provisional": digests, "refine_distortion": distorts}
         if stage == "adjust_bundle":
             model = self.configuration.index_images.camera_model
             return {"images": str(self.images), "intrinsics": inputs.intrinsics, "camera_model": model}

@@ -49,11 +49,11 @@ class CalibrateCamerasOptions(StageOptions):
     """Relative standard deviation of the default focal length, as a prior."""
 
     provisional_model: Literal["auto"] | bool = "auto"
-    """Check the focal lengths with a quick model of the strongest pairs, and use its cameras if they
-    differ; 'auto' does so if most images have a camera of their own."""
+    """Check estimated focal lengths with a quick model of the strongest pairs, and use its cameras if
+    they differ; 'auto' does so if most images have a camera of their own."""
 
     provisional_pairs: int = Field(default=6, ge=2, le=1000)
-    """Largest number of image pairs per camera in the provisional model."""
+    """Number of strongest pairs per image in the provisional model."""
 
     min_revision_sigmas: float = Field(default=2.0, ge=0, le=100)
     """The cameras of the provisional model are used if its focal lengths differ by more than this many

@@ -65,7 +65,7 @@ def run(job: StageJob) -> None:
     covered = cover_images(cells)
     if options.estimate_focals and not given.all():
         cameras, sigmas, counts = _calibrate(job, index, cameras, matched, covered)
-        cameras = _revised(job, index, cameras, sigmas, counts, cells, matched)
+        cameras, sigmas = _revised(job, index, cameras, sigmas, counts, cells, matched)
     warnings = [OVERLAY.format(percent=100 * grid.mean()) for grid in covered.values()]
     _artifact(cameras, sigmas, counts, cells, warnings).write(job.output, job.header)
     for line in warnings:
@@ -120,8 +120,11 @@ def _revised(
     counts: Array,
     cells: Array,
     matched: "_MatchedImages",
-) -> list[Camera]:
-    """The cameras as a provisional model has them, if its focal lengths are others."""
+) -> tuple[list[Camera], Array]:
+    """The cameras as a provisional model has them, if its focal lengths are others, and their deviations.
+
+    Focal lengths that EXIF tells stay: a quick model knows them no better.
+    """
     # most scenes need none of it
     from snakesfm.bundle.keypoint_refinement import most_share_a_camera
     from snakesfm.calibration.focal import choose_pairs
@@ -130,15 +133,16 @@ def _revised(
     options: CalibrateCamerasOptions = job.options
     wanted = options.provisional_model
     if wanted == "auto":
-        wanted = len(index.names) >= LEAST_IMAGES and not most_share_a_camera(index.camera_ids)
-    if not wanted:
-        return cameras
-    free = np.array([camera.source != "given" for camera in cameras], dtype=bool)
+        wanted = not most_share_a_camera(index.camera_ids)
+    # those of no sigma have a default
+    doubtful = ~(sigmas <= options.exif_sigma)
+    if not wanted or np.count_nonzero(doubtful[index.camera_ids]) < LEAST_IMAGES:
+        return cameras, sigmas
     chosen = choose_pairs(
         matched.pairs,
         matched.counts,
-        index.camera_ids,
-        free,
+        np.arange(len(index.names)),
+        doubtful[index.camera_ids],
         options.provisional_pairs,
         options.min_matches,
     )
@@ -148,10 +152,14 @@ def _revised(
         )
     except SceneError as error:
         print(f"no provisional model: {error}", flush=True)
-        return cameras
+        return cameras, sigmas
     adjusted = cameras_from_columns(model.camera_models, model.camera_sizes, model.camera_params)
-    posed = np.isin(np.arange(len(cameras)), index.camera_ids[model.models >= 0])
-    rows = np.flatnonzero(free & posed & (model.camera_resets == "")).tolist()
+    sizes = np.bincount(model.models[model.models >= 0])
+    told = np.zeros(len(cameras), dtype=bool)
+    told[index.camera_ids[(model.models >= 0) & (sizes[model.models] >= LEAST_IMAGES)]] = True
+    ratios = np.array([camera.focal_px / max(camera.width, camera.height) for camera in adjusted])
+    told &= (ratios > options.min_focal_ratio) & (ratios < options.max_focal_ratio)
+    rows = np.flatnonzero(doubtful & told & (model.camera_resets == "")).tolist()
     changes = [abs(math.log(adjusted[row].focal_px / cameras[row].focal_px)) for row in rows]
     deviations = np.where(np.isnan(sigmas), options.default_sigma, sigmas)[rows]
     change = float(np.median(changes / deviations)) if rows else 0.0
@@ -162,9 +170,12 @@ def _revised(
         flush=True,
     )
     if not used:
-        return cameras
+        return cameras, sigmas
     revised = {row: replace(adjusted[row], source="estimated") for row in rows}
-    return [revised.get(row, camera) for row, camera in enumerate(cameras)]
+    unknown = np.isin(np.arange(len(cameras)), rows)
+    return [revised.get(row, camera) for row, camera in enumerate(cameras)], np.where(
+        unknown, np.nan, sigmas
+    )
 
 
 def _artifact(
@@ -213,18 +224,19 @@ class _MatchedImages:
             yield row, self._keypoints[i][best[:, 0]], self._keypoints[j][best[:, 1]]
 
     def deal(self, rows: Array, count: int) -> list[PairMatches]:
-        """Some rows in so many artifacts."""
-        return [self._select(rows[part::count]) for part in range(min(count, len(rows)))]
+        """Some rows, ascending, in up to so many artifacts, none of them empty."""
+        dealt = np.array_split(rows, min(count, len(rows))) if len(rows) else []
+        return [self._select(part) for part in dealt]
 
     def _select(self, rows: Array) -> PairMatches:
         parts = {row: (matches, scores) for row, matches, scores in self._parts(rows)}
-        ordered = [parts[row] for row in sorted(parts)]
+        matches, scores = zip(*(parts[row] for row in rows.tolist()), strict=True)
         return PairMatches(
-            self.pairs[sorted(parts)].astype(np.int32),
-            np.full(len(parts), "", dtype=object),
-            offsets_of([len(scores) for _, scores in ordered]),
-            np.concatenate([np.zeros((0, 2), np.int32), *(matches for matches, _ in ordered)]),
-            np.concatenate([np.zeros(0, np.float32), *(scores for _, scores in ordered)]),
+            self.pairs[rows],
+            [""] * len(rows),
+            offsets_of([len(part) for part in scores]),
+            np.concatenate(matches),
+            np.concatenate(scores),
         )
 
     def _parts(self, rows: Array) -> Iterator[tuple[int, Array, Array]]:

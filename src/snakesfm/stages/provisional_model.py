@@ -1,6 +1,5 @@
 """A quick model of a scene, made for what its bundle adjustment says of the cameras."""
 
-import tempfile
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -8,6 +7,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
+from snakesfm.artifacts.base import temporary_folder
 from snakesfm.artifacts.images import CalibratedCameras
 from snakesfm.artifacts.mapping import Reconstruction
 from snakesfm.artifacts.pairs import PairMatches
@@ -28,7 +28,7 @@ STEPS = {
     ),
 }
 # focal lengths to a few per cent need neither all observations nor the last digit
-QUICK = {
+QUICK: dict[str, dict[str, Any]] = {
     "adjust_bundle": {
         "thresholds_px": (10.0, 5.0),
         "complete_tracks": False,
@@ -45,7 +45,8 @@ def make_provisional_model(
 ) -> Reconstruction:
     """The model that the stages from estimate_two_view to adjust_bundle make of some pairs.
 
-    They have their default options, so that it does not depend on those for the model itself.
+    They have their default options, so that it does not depend on those for the model itself. Distortion
+    is refined where it is in the model, as it would stay otherwise.
 
     Parameters
     ----------
@@ -57,7 +58,7 @@ def make_provisional_model(
     ------
     SceneError : they give no model.
     """
-    with tempfile.TemporaryDirectory(prefix="snakesfm-") as folder:
+    with temporary_folder(job.output.parent) as folder:
         files: dict[str, Any] = {name: job.inputs[name] for name in ("index", "features")}
         files["cameras"] = Path(folder, "cameras.h5")
         cameras.write(files["cameras"], job.header)
@@ -81,13 +82,16 @@ def _step(job: StageJob, stage: str, files: dict[str, Any], output: Path) -> Sta
     # jobs are spared what checks options, unless they need it
     from snakesfm.config.configuration import options_class
 
+    changes = dict(QUICK.get(stage, {}))
+    if stage == "adjust_bundle":
+        changes["refine_distortion"] = job.settings.get("refine_distortion", True)
     names = ("index", "features", *STEPS[stage][0])
     return replace(
         job,
         stage=stage,
         inputs={name: files[name] for name in names},
         outputs=(output,),
-        options=options_class(stage)(**QUICK.get(stage, {})).resolved(),
+        options=options_class(stage)(**changes).resolved(),
         former=None,
         terminal=None,
     )

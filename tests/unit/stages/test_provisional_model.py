@@ -64,6 +64,9 @@ def test_estimates_far_from_what_the_model_says_are_revised(monkeypatch, made, t
     assert np.median(after) < 0.03 and np.median(before) > 0.2
     assert after.max() < 0.15
     assert found.sources.tolist() == ["estimated"] * COUNT
+    # the estimates' deviations are refuted
+    assert np.isnan(found.focal_sigma).all()
+    assert [path.name for path in tmp_path.iterdir() if path.is_dir()] == []
     assert "its cameras are used" in capsys.readouterr().out
 
 
@@ -95,6 +98,19 @@ def test_images_of_one_camera_have_no_provisional_model(monkeypatch, made, tmp_p
     job = job_of(replace(one, cameras=(replace(one.cameras[0], source="default"),)), tmp_path)
     calibrate_cameras.run(job)
     assert "provisional" not in capsys.readouterr().out
+
+
+def test_what_exif_tells_stays(monkeypatch, made, tmp_path, capsys):
+    ratios, found = calibrate(monkeypatch, made, tmp_path, FACTORS, CalibrateCamerasOptions().exif_sigma)
+    np.testing.assert_allclose(ratios, FACTORS, rtol=1e-12)
+    assert np.isfinite(found.focal_sigma).all()
+    assert "provisional" not in capsys.readouterr().out
+
+
+def test_implausible_focal_lengths_stay(monkeypatch, made, tmp_path):
+    ratio = made.cameras[0].focal_px / max(made.cameras[0].width, made.cameras[0].height)
+    ratios, _ = calibrate(monkeypatch, made, tmp_path, FACTORS, 0.05, max_focal_ratio=0.8 * ratio)
+    np.testing.assert_allclose(ratios, FACTORS, rtol=1e-12)
 
 
 def test_without_a_model_the_estimates_stay(monkeypatch, made, tmp_path, capsys):
