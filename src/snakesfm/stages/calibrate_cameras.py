@@ -233,7 +233,7 @@ class _MatchedImages:
         matches, scores = zip(*(parts[row] for row in rows.tolist()), strict=True)
         return PairMatches(
             self.pairs[rows],
-            [""] * len(rows),
+            np.full(len(rows), "", dtype=object),
             offsets_of([len(part) for part in scores]),
             np.concatenate(matches),
             np.concatenate(scores),
