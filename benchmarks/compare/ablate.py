@@ -4,7 +4,6 @@ import json
 import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +13,7 @@ from benchmarks.compare.inputs import inputs_of, source_digest
 from benchmarks.compare.measure import CommandError
 from benchmarks.compare.methods import snakesfm
 from benchmarks.compare.sets import ImageSet
+from benchmarks.machine import today
 from benchmarks.markdown import markdown_head, markdown_row
 from snakesfm.config.configuration import STAGES, load_configuration
 from snakesfm.errors import ConfigError
@@ -86,8 +86,7 @@ def ablate(
             store.write_text(json.dumps(values, indent=1, sort_keys=True) + "\n", "utf-8")
     areas = {key: value.get(AREA) for key, value in values.items()}
     truth = {image_set.name: image_set.truth for image_set in sets}
-    today = datetime.now(UTC).strftime("%Y-%m-%d")
-    text = render_ablations(areas, [ablation.name for ablation in ablations], truth, today)
+    text = render_ablations(areas, [ablation.name for ablation in ablations], truth, today())
     (out / "ablations.md").write_text(text, "utf-8")
 
 

@@ -12,6 +12,7 @@ import numpy as np
 from snakesfm.arrays import Array
 from snakesfm.artifacts.gather import gather_keypoints
 from snakesfm.artifacts.images import CalibratedCameras, ImageIndex
+from snakesfm.artifacts.mapping import Reconstruction
 from snakesfm.artifacts.pairs import PairMatches
 from snakesfm.errors import SceneError
 from snakesfm.geometry.camera import Camera, cameras_from_columns, cameras_to_columns
@@ -65,7 +66,8 @@ def run(job: StageJob) -> None:
     covered = cover_images(cells)
     if options.estimate_focals and not given.all():
         cameras, sigmas, counts = _calibrate(job, index, cameras, matched, covered)
-        cameras, sigmas = _revised(job, index, cameras, sigmas, counts, cells, matched)
+        estimated = _artifact(cameras, sigmas, counts, cells, [])
+        cameras, sigmas = _revised(job, index, cameras, estimated, matched)
     warnings = [OVERLAY.format(percent=100 * grid.mean()) for grid in covered.values()]
     _artifact(cameras, sigmas, counts, cells, warnings).write(job.output, job.header)
     for line in warnings:
@@ -116,14 +118,16 @@ def _revised(
     job: StageJob,
     index: ImageIndex,
     cameras: list[Camera],
-    sigmas: Array,
-    counts: Array,
-    cells: Array,
+    estimated: CalibratedCameras,
     matched: "_MatchedImages",
 ) -> tuple[list[Camera], Array]:
     """The cameras as a provisional model has them, if its focal lengths are others, and their deviations.
 
     Focal lengths that EXIF tells stay: a quick model knows them no better.
+
+    Parameters
+    ----------
+    cameras, estimated : the cameras so far, and the same as an artifact.
     """
     # most scenes need none of it
     from snakesfm.bundle.keypoint_refinement import most_share_a_camera
@@ -131,6 +135,7 @@ def _revised(
     from snakesfm.stages.provisional_model import make_provisional_model
 
     options: CalibrateCamerasOptions = job.options
+    sigmas = estimated.focal_sigma
     wanted = options.provisional_model
     if wanted == "auto":
         wanted = not most_share_a_camera(index.camera_ids)
@@ -147,19 +152,12 @@ def _revised(
         options.min_matches,
     )
     try:
-        model = make_provisional_model(
-            job, _artifact(cameras, sigmas, counts, cells, []), matched.deal(chosen, job.threads)
-        )
+        model = make_provisional_model(job, estimated, matched.deal(chosen, job.threads))
     except SceneError as error:
         print(f"no provisional model: {error}", flush=True)
         return cameras, sigmas
     adjusted = cameras_from_columns(model.camera_models, model.camera_sizes, model.camera_params)
-    sizes = np.bincount(model.models[model.models >= 0])
-    told = np.zeros(len(cameras), dtype=bool)
-    told[index.camera_ids[(model.models >= 0) & (sizes[model.models] >= LEAST_IMAGES)]] = True
-    ratios = np.array([camera.focal_px / max(camera.width, camera.height) for camera in adjusted])
-    told &= (ratios > options.min_focal_ratio) & (ratios < options.max_focal_ratio)
-    rows = np.flatnonzero(doubtful & told & (model.camera_resets == "")).tolist()
+    rows = np.flatnonzero(doubtful & _told(index, model, adjusted, options)).tolist()
     changes = [abs(math.log(adjusted[row].focal_px / cameras[row].focal_px)) for row in rows]
     deviations = np.where(np.isnan(sigmas), options.default_sigma, sigmas)[rows]
     change = float(np.median(changes / deviations)) if rows else 0.0
@@ -171,11 +169,27 @@ def _revised(
     )
     if not used:
         return cameras, sigmas
-    revised = {row: replace(adjusted[row], source="estimated") for row in rows}
-    unknown = np.isin(np.arange(len(cameras)), rows)
-    return [revised.get(row, camera) for row, camera in enumerate(cameras)], np.where(
-        unknown, np.nan, sigmas
-    )
+    cameras, sigmas = cameras.copy(), sigmas.copy()
+    # what was claimed is refuted
+    sigmas[rows] = np.nan
+    for row in rows:
+        cameras[row] = replace(adjusted[row], source="estimated")
+    return cameras, sigmas
+
+
+def _told(
+    index: ImageIndex,
+    model: Reconstruction,
+    adjusted: list[Camera],
+    options: "CalibrateCamerasOptions",
+) -> Array:
+    """Which cameras (C,) bool a model of enough images has with a plausible focal length."""
+    sizes = np.bincount(model.models[model.models >= 0])
+    told = np.zeros(len(adjusted), dtype=bool)
+    told[index.camera_ids[(model.models >= 0) & (sizes[model.models] >= LEAST_IMAGES)]] = True
+    ratios = np.array([camera.focal_px / max(camera.width, camera.height) for camera in adjusted])
+    plausible = (ratios > options.min_focal_ratio) & (ratios < options.max_focal_ratio)
+    return np.asarray(told & plausible & (model.camera_resets == ""))
 
 
 def _artifact(

@@ -28,15 +28,13 @@ STEPS = {
     ),
 }
 # focal lengths to a few per cent need neither all observations nor the last digit
-QUICK: dict[str, dict[str, Any]] = {
-    "adjust_bundle": {
-        "thresholds_px": (10.0, 5.0),
-        "complete_tracks": False,
-        "register_images": False,
-        "refine_keypoints": False,
-        "refine_principal_points": False,
-        "function_tolerance": 3e-4,
-    }
+QUICK_ADJUSTMENT = {
+    "thresholds_px": (10.0, 5.0),
+    "complete_tracks": False,
+    "register_images": False,
+    "refine_keypoints": False,
+    "refine_principal_points": False,
+    "function_tolerance": 3e-4,
 }
 
 
@@ -82,9 +80,10 @@ def _step(job: StageJob, stage: str, files: dict[str, Any], output: Path) -> Sta
     # jobs are spared what checks options, unless they need it
     from snakesfm.config.configuration import options_class
 
-    changes = dict(QUICK.get(stage, {}))
+    changes: dict[str, Any] = {}
     if stage == "adjust_bundle":
-        changes["refine_distortion"] = job.settings.get("refine_distortion", True)
+        distorts = job.settings.get("refine_distortion", True)
+        changes = {**QUICK_ADJUSTMENT, "refine_distortion": distorts}
     names = ("index", "features", *STEPS[stage][0])
     return replace(
         job,
