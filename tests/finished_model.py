@@ -170,6 +170,7 @@ def export(
     reset: str = "",
     offset: float = np.nan,
     second: Iterable[int] = (),
+    intrinsics: str = "refine",
     **options: bool,
 ) -> Path:
     inputs = {
@@ -189,7 +190,7 @@ def export(
             inputs,
             tuple(folder / file for file in FILES),
             ExportModelOptions(**options),
-            {"images": str(images)} | ({"masks": str(masks)} if masks else {}),
+            {"images": str(images), "intrinsics": intrinsics} | ({"masks": str(masks)} if masks else {}),
         )
     )
     return folder

@@ -370,7 +370,8 @@ class ScenePlan:
         if stage == "export_model":
             masks = {"masks": str(self.masks)} if inputs.masks else {}
             # the model's folder links to what the image folder is, which may be a link that is turned
-            return {"images": str(self.images), "images_target": str(self.images.resolve())} | masks
+            links = {"images": str(self.images), "images_target": str(self.images.resolve())}
+            return links | {"intrinsics": inputs.intrinsics} | masks
         if stage == "evaluate_model":
             return {"reference": inputs.reference, "reference_content": model_digest(inputs.reference)}
         return {}

@@ -3,6 +3,7 @@
 import json
 import shutil
 import sys
+from collections.abc import Collection
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -60,6 +61,11 @@ OTHER_LENS = (
     "camera {camera} ({model}): reprojection errors grow with distance from the principal point, so this "
     "model does not describe the lens; try another index_images.camera_model (RADIAL, OPENCV) or other "
     "intrinsics."
+)
+
+OTHER_GIVEN_LENS = (
+    "camera {camera} ({model}): reprojection errors grow with distance from the principal point, so the "
+    "given intrinsics do not describe the lens; intrinsics=refine starts from them and refines them."
 )
 
 RESET_CAMERA = (
@@ -142,7 +148,9 @@ def _warnings(
     names = [str(name) for name in index.names]
     used = {row: cameras[row] for row in sorted({int(index.camera_ids[row]) for row in registered})}
     warnings = _camera_warnings(adjusted, used)
-    warnings += _lens_warnings(model, cameras, index.camera_ids)
+    fixed = job.settings["intrinsics"] == "fixed"
+    held = {row for row in used if fixed and index.camera_sources[row] == "given"}
+    warnings += _lens_warnings(model, cameras, index.camera_ids, held)
     if job.options.undistort:
         warnings += _cut_warnings(used)
     if len({camera.is_fisheye for camera in used.values()}) > 1:
@@ -189,8 +197,10 @@ def _some_cameras(lines: list[str]) -> list[str]:
     return lines if more < 2 else [*lines[:MOST_CAMERAS], MORE_CAMERAS.format(count=more)]
 
 
-def _lens_warnings(model: Reconstruction, cameras: list[Camera], camera_ids: np.ndarray) -> list[str]:
-    """A sentence per camera whose lens is not of its model."""
+def _lens_warnings(
+    model: Reconstruction, cameras: list[Camera], camera_ids: np.ndarray, held: Collection[int]
+) -> list[str]:
+    """A sentence per camera whose lens is not of its model; the parameters of those ``held`` were given."""
     some = slice(None, None, -(-len(model.image_ids) // OBSERVATIONS_OF_LENSES) or 1)
     images = model.image_ids[some]
     points = model.points[np.repeat(np.arange(len(model.points)), np.diff(model.offsets))[some]]
@@ -200,7 +210,9 @@ def _lens_warnings(model: Reconstruction, cameras: list[Camera], camera_ids: np.
     )
     return _some_cameras(
         [
-            OTHER_LENS.format(camera=row + 1, model=cameras[row].model)
+            (OTHER_GIVEN_LENS if row in held else OTHER_LENS).format(
+                camera=row + 1, model=cameras[row].model
+            )
             for row, fit in fits.items()
             if fit.misfit > MAX_MISFIT
         ]

@@ -164,15 +164,25 @@ def test_an_image_that_exif_turns_is_shown_as_it_is_stored(tmp_path, problem) ->
     assert (folder / "images").is_symlink()
 
 
-@pytest.mark.parametrize(("distortion", "told"), [(0.02, 0), (0.3, 1)])
-def test_a_lens_of_another_distortion_is_warned_of(tmp_path, distortion: float, told: int) -> None:
+@pytest.mark.parametrize(
+    ("distortion", "intrinsics", "remedy"),
+    [
+        (0.02, "fixed", None),
+        (0.3, "fixed", "the given intrinsics do not describe the lens; intrinsics=refine"),
+        (0.3, "refine", "this model does not describe the lens; try another index_images.camera_model"),
+    ],
+)
+def test_a_lens_of_another_distortion_is_warned_of(
+    tmp_path, distortion: float, intrinsics: str, remedy: str | None
+) -> None:
     lens = dataclasses.replace(CAMERA, params=(*CAMERA.params[:3], distortion))
     seen = make_problem(camera_count=COUNT, point_count=3000, noise_px=0.1, camera=lens)
-    summary = json.loads((export(tmp_path, seen, lost=()) / "summary.json").read_text("utf-8"))
+    folder = export(tmp_path, seen, lost=(), intrinsics=intrinsics)
+    summary = json.loads((folder / "summary.json").read_text("utf-8"))
     # the second camera has but four images
-    found = [line for line in summary["warnings"] if "does not describe the lens" in line]
-    assert len(found) == told
-    assert all(line.startswith("camera 1 (SIMPLE_RADIAL)") for line in found)
+    found = [line for line in summary["warnings"] if "describe the lens" in line]
+    assert len(found) == (remedy is not None)
+    assert all(line.startswith("camera 1 (SIMPLE_RADIAL)") and str(remedy) in line for line in found)
 
 
 @pytest.mark.parametrize(("reset", "told"), [("", 0), ("distortion", 1)])
@@ -241,7 +251,7 @@ def test_a_problem_of_many_cameras_is_told_of_some(monkeypatch, count: int, name
             export_model._camera_warnings(adjusted, dict.fromkeys(range(count), folding))
         ),
         ("does not describe the lens",): export_model._lens_warnings(
-            one, [folding] * count, np.zeros(1, int)
+            one, [folding] * count, np.zeros(1, int), ()
         ),
         ("undistorted/ shows only",): export_model._cut_warnings(dict.fromkeys(range(count), wide)),
     }
