@@ -136,7 +136,7 @@ class RunOptions(SceneInputs):
     scenes: dict[str, SceneInputs] = Field(default_factory=dict)
     """Several scenes: a mapping from name to images, cameras, masks and the other inputs of a scene."""
     seed: int = Field(default=0, ge=0)
-    """Seed of the random draws; the same seed gives the same model."""
+    """Seed of the random draws; the same seed gives the same model, large ones up to the rounding of the solver."""
     blocks: Annotated[int, Field(ge=1)] | Literal["auto"] = "auto"
     """Number of blocks the images are split into; B blocks give B(B+1)/2 tiles of pairs, one job each.
     'auto' depends on the number of images."""
