@@ -15,8 +15,9 @@ from benchmarks.compare.methods import snakesfm
 from benchmarks.compare.sets import ImageSet
 from benchmarks.machine import today
 from benchmarks.markdown import markdown_head, markdown_row
-from snakesfm.config.configuration import STAGES, load_configuration
+from snakesfm.config.configuration import load_configuration
 from snakesfm.errors import ConfigError
+from snakesfm.pipeline import STAGES
 
 DEFAULT = "default"
 AREA = "relative_pose_auc_1deg"

@@ -17,7 +17,7 @@ from pathlib import Path
 from benchmarks import ROOT
 from benchmarks.growth.measure import load, measure, save
 from benchmarks.growth.report import write_report
-from snakesfm.config.configuration import STAGES
+from snakesfm.pipeline import STAGES
 from snakesfm.simulate import UNTIL, SimulationOptions
 from snakesfm.synthetic.surveys import SURVEYS
 

@@ -19,12 +19,12 @@ from pydantic.fields import FieldInfo
 
 from snakesfm.artifacts import ARTIFACTS
 from snakesfm.config.configuration import (
-    STAGES,
     RunOptions,
     SceneInputs,
     configuration_class,
     options_class,
 )
+from snakesfm.pipeline import STAGES
 
 WIDTH = 110
 FILES = {

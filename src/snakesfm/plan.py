@@ -6,8 +6,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from snakesfm.config.configuration import STAGES, list_scenes, load_configuration
+from snakesfm.config.configuration import list_scenes, load_configuration
 from snakesfm.errors import ConfigError
+from snakesfm.pipeline import STAGES
 from snakesfm.scene_checks import check_scene
 from snakesfm.scene_plan import ScenePlan
 

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from snakesfm.config.configuration import STAGES, options_class
+from snakesfm.config.configuration import options_class
 from snakesfm.errors import ConfigError
 from snakesfm.given_files import (
     NO_CAMERAS,
@@ -21,6 +21,7 @@ from snakesfm.ingest.discover import (
     walk_images,
 )
 from snakesfm.ingest.masks import find_mask
+from snakesfm.pipeline import STAGES
 from snakesfm.scene_plan import ScenePlan
 
 CORRECT = "correct its images: in the file that lists it"

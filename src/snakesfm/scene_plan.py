@@ -13,7 +13,7 @@ from typing import Any
 
 from snakesfm.blocks import choose_blocks, tile_names
 from snakesfm.config.base import StageOptions
-from snakesfm.config.configuration import STAGES, SceneInputs, options_class
+from snakesfm.config.configuration import SceneInputs, options_class
 from snakesfm.config.select_pairs import SelectPairsOptions
 from snakesfm.digests import file_digest, file_state, model_digest, options_digest, settings_text
 from snakesfm.front_ends import (
@@ -29,6 +29,7 @@ from snakesfm.hloc_files import FEATURES, MATCHES, PAIRS
 from snakesfm.ingest.discover import MASK_DIGESTS_NAME, count_images, fingerprint_images
 from snakesfm.model_files import MODEL_FILES
 from snakesfm.pair_lists import estimate_pair_count, find_pair_list, pair_list_state
+from snakesfm.pipeline import STAGES
 from snakesfm.resources import UNDISTORTING_THREADS, Load, job_load
 
 SCENE_ARTIFACTS = (

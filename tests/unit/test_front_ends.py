@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from snakemake.cli import get_argument_parser
 
-from snakesfm.config.configuration import STAGES, FrontEndName, options_class
+from snakesfm.config.configuration import FrontEndName, options_class
 from snakesfm.digests import settings_text
 from snakesfm.errors import ConfigError
 from snakesfm.features.extraction import DETECTORS
@@ -27,6 +27,7 @@ from snakesfm.front_ends import (
 from snakesfm.learned.weights import WEIGHT_FILES
 from snakesfm.matching.detector_free import DETECTOR_FREE_MATCHERS
 from snakesfm.matching.matcher import MATCHERS
+from snakesfm.pipeline import STAGES
 from snakesfm.plan import Plan
 from snakesfm.retrieval.descriptor import DESCRIPTORS
 from snakesfm.rule_inputs import (

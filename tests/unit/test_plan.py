@@ -8,9 +8,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from snakesfm.blocks import choose_blocks, deal_blocks, tile_names
-from snakesfm.config.configuration import STAGES, options_class
+from snakesfm.config.configuration import options_class
 from snakesfm.digests import file_digest, model_digest, settings_text
 from snakesfm.errors import ConfigError
+from snakesfm.pipeline import STAGES
 from snakesfm.plan import Plan
 from snakesfm.records import split_words
 from snakesfm.rule_inputs import global_descriptors, previewed_features

@@ -5,8 +5,8 @@ from pathlib import Path
 import pytest
 
 from snakesfm.blocks import choose_blocks
-from snakesfm.config.configuration import STAGES
 from snakesfm.config.select_pairs import SelectPairsOptions
+from snakesfm.pipeline import STAGES
 from snakesfm.resources import (
     NEEDS,
     START_MIN,

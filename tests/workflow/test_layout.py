@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from snakesfm.config.configuration import STAGES, configuration_class, options_class
+from snakesfm.config.configuration import configuration_class, options_class
+from snakesfm.pipeline import STAGES
 from snakesfm.scene_plan import STAGES_IN_DETECTOR_PIXELS, STAGES_WITH_NETWORKS
 
 DOMAIN_MAY_IMPORT_NOT = (

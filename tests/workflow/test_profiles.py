@@ -7,7 +7,7 @@ import pytest
 import yaml
 from workflow_runner import Workflow
 
-from snakesfm.config.configuration import STAGES
+from snakesfm.pipeline import STAGES
 from snakesfm.scene_plan import STAGES_WITH_NETWORKS
 
 pytestmark = pytest.mark.workflow

@@ -20,7 +20,7 @@ from workflow_runner import Workflow, config_of, copy_run, model_bytes
 from benchmarks.compare.measure import Cost
 from benchmarks.compare.methods import AFTER, GROUPS, job_counts, stage_costs
 from snakesfm.artifacts import LocalFeatures, Reconstruction
-from snakesfm.config.configuration import STAGES
+from snakesfm.pipeline import STAGES
 from snakesfm.start import NO_SERVER, VARIABLE
 
 MAPPING = [

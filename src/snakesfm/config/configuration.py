@@ -15,31 +15,7 @@ from pydantic_core import ErrorDetails
 
 from snakesfm.config.base import Options, StageOptions
 from snakesfm.errors import ConfigError
-
-STAGES: tuple[str, ...] = (
-    "index_images",
-    "extract_features",
-    "learn_vocabulary",
-    "describe_images",
-    "select_pairs",
-    "match_pairs",
-    "merge_keypoints",
-    "index_matches",
-    "calibrate_cameras",
-    "estimate_two_view",
-    "build_view_graph",
-    "filter_view_graph",
-    "average_rotations",
-    "build_tracks",
-    "average_translations",
-    "triangulate_tracks",
-    "adjust_bundle",
-    "export_database",
-    "export_hloc",
-    "export_model",
-    "evaluate_model",
-    "render_report",
-)
+from snakesfm.pipeline import STAGES
 
 # what may look like a number or a date and is a name all the same
 TEXT_KEYS = (
@@ -136,7 +112,7 @@ class RunOptions(SceneInputs):
     scenes: dict[str, SceneInputs] = Field(default_factory=dict)
     """Several scenes: a mapping from name to images, cameras, masks and the other inputs of a scene."""
     seed: int = Field(default=0, ge=0)
-    """Seed of the random draws; the same seed gives the same model, large ones up to the rounding of the solver."""
+    """Seed of the random draws; the same seed gives the same model (a large one but for rounding)."""
     blocks: Annotated[int, Field(ge=1)] | Literal["auto"] = "auto"
     """Number of blocks the images are split into; B blocks give B(B+1)/2 tiles of pairs, one job each.
     'auto' depends on the number of images."""

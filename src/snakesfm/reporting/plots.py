@@ -12,6 +12,11 @@ from snakesfm.geometry.poses import center_of
 
 MAP_PX = 560
 MARGIN = 0.05
+# of the middle of all centres, so much more is shown on either side where there are any
+REACH = 1.0
+MARK_PX = 11.0
+# more cameras have smaller marks, which would else hide the points
+FULL_SIZE_MARKS = 50
 HISTOGRAM_SIZE = (560, 180)
 
 
@@ -69,6 +74,23 @@ def view_axes(rotations: Array, translations: Array) -> Array:
     return np.array([east, np.cross(up, east), up])
 
 
+def map_box(centers: Array, points: Array) -> tuple[Array, Array]:
+    """The lowest and highest of each axis that a map shows: cameras far away from all others are outside.
+
+    Parameters
+    ----------
+    centers, points : (n,k) and (T,k) along the map's axes, n >= 1.
+    """
+    low, high = np.percentile(centers, [5, 95], axis=0)
+    reach = REACH * float((high - low).max())
+    low = np.maximum(centers.min(axis=0), low - reach)
+    high = np.minimum(centers.max(axis=0), high + reach)
+    if len(points):
+        low = np.minimum(low, np.percentile(points, 2, axis=0))
+        high = np.maximum(high, np.percentile(points, 98, axis=0))
+    return low, high
+
+
 def scene_map(
     names: Sequence[str],
     rotations: Array,
@@ -76,8 +98,10 @@ def scene_map(
     points: Array,
     colors: Array,
     axes: Array,
-) -> str:
+) -> tuple[str, int]:
     """Points as a picture and cameras as triangles that name their image, seen along ``axes[2]``.
+
+    Beside the map, how many cameras lie outside it.
 
     Parameters
     ----------
@@ -87,10 +111,8 @@ def scene_map(
     """
     centers = center_of(rotations, translations) @ axes.T
     places = points @ axes.T
-    low, high = centers[:, :2].min(axis=0), centers[:, :2].max(axis=0)
-    if len(places):
-        low = np.minimum(low, np.percentile(places[:, :2], 2, axis=0))
-        high = np.maximum(high, np.percentile(places[:, :2], 98, axis=0))
+    low, high = map_box(centers[:, :2], places[:, :2])
+    outside = int(np.count_nonzero(((centers[:, :2] < low) | (centers[:, :2] > high)).any(axis=1)))
     extent = max(float((high - low).max()), 1e-9)
     low, high = low - MARGIN * extent, high + MARGIN * extent
     scale = MAP_PX / float((high - low).max())
@@ -101,18 +123,21 @@ def scene_map(
 
     picture = _point_picture(pixels(places), places[:, 2], colors, (width, height))
     forward = rotations[:, 2] @ axes.T
+    long = MARK_PX * min(1.0, (FULL_SIZE_MARKS / len(names)) ** 0.25)
+    mark = f"M0 0L{long:.1f} {-long / 2.2:.1f}V{long / 2.2:.1f}Z"
     marks = []
     for name, place, look in zip(names, pixels(centers), forward, strict=True):
         angle = np.degrees(np.arctan2(-look[1], look[0]))
         marks.append(
-            f'<path d="M0 0L11 -5L11 5Z" transform="translate({place[0]:.1f} {place[1]:.1f}) '
+            f'<path d="{mark}" transform="translate({place[0]:.1f} {place[1]:.1f}) '
             f'rotate({angle:.0f})"><title>{html.escape(name)}</title></path>'
         )
-    return (
+    shown = (
         f'<svg viewBox="0 0 {width} {height}" class="plot map" style="max-width:{width}px">'
         f'<image href="data:image/png;base64,{picture}" width="{width}" height="{height}"/>'
         f'<g class="cameras">{"".join(marks)}</g></svg>'
     )
+    return shown, outside
 
 
 def _point_picture(pixels: Array, heights: Array, colors: Array, size: tuple[int, int]) -> str:

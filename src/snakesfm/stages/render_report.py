@@ -27,6 +27,7 @@ from snakesfm.artifacts.pairs import EDGE_LABELS, KINDS, REJECTIONS
 from snakesfm.geometry.camera import cameras_from_columns, observation_errors
 from snakesfm.grouping import rows_of_each
 from snakesfm.job_logs import stage_costs
+from snakesfm.pipeline import STAGES
 from snakesfm.reporting.page import Page, render_page
 from snakesfm.reporting.plots import error_histogram, scene_map, view_axes
 from snakesfm.reporting.registration import (
@@ -197,10 +198,13 @@ def _maps(names: Sequence[str], model: Reconstruction, registered: Array) -> lis
     rotations, translations = model.rotations[registered], model.translations[registered]
     axes = view_axes(rotations, translations)
     content = ([names[row] for row in registered], rotations, translations, model.points, model.colors)
-    return [
-        ("From above", scene_map(*content, axes)),
-        ("From the side", scene_map(*content, np.array([axes[0], axes[2], -axes[1]]))),
-    ]
+    views = {"From above": axes, "From the side": np.array([axes[0], axes[2], -axes[1]])}
+    maps = []
+    for caption, view in views.items():
+        picture, outside = scene_map(*content, view)
+        far = f"; {outside:,} cameras are too far away to be shown" if outside else ""
+        maps.append((caption + far, picture))
+    return maps
 
 
 def _stage_rows(
@@ -244,8 +248,7 @@ def _stage_rows(
             f"inlier matches before merging keypoints: {describe_lengths(tracks['lengths_unmerged'])}; "
             f"after merging: {describe_lengths(tracks['lengths_merged'])}"
         )
-    stages = [stage for stage in seconds if stage not in results]
-    rows = [[stage, text] for stage, text in results.items()] + [[stage, ""] for stage in stages]
+    rows = [[stage, results.get(stage, "")] for stage in STAGES if stage in results or stage in seconds]
     return [[*row, *seconds.get(row[0], (None, None))] for row in rows] if seconds else rows
 
 
@@ -287,4 +290,5 @@ def _options(job: StageJob) -> dict[str, str]:
     """The options that the artifacts say they were made with, by stage."""
     paths = [path for name in sorted(job.inputs) for path in job.paths(name)[:1]]
     headers = [read_header(path) for path in paths if path.suffix == ".h5"]
-    return {str(header["stage"]): str(header["options"]) for header in headers if "stage" in header}
+    options = {str(header["stage"]): str(header["options"]) for header in headers if "stage" in header}
+    return {stage: options[stage] for stage in STAGES if stage in options}

@@ -1,10 +1,13 @@
 """evaluate_model and render_report on small artifacts with exact truth."""
 
 import json
+import re
 
 import pycolmap
 import pytest
 from finished_model import COUNT, LOST, NAMES, evaluate, export, report
+
+from snakesfm.pipeline import STAGES
 
 
 def test_evaluation_against_the_exported_truth(tmp_path, problem) -> None:
@@ -40,6 +43,9 @@ def test_report_says_what_happened_and_escapes_names(tmp_path, problem) -> None:
     assert "cycle_median" in page
     assert "focal lengths: 2 given; median standard deviation 2.0 %" in page
     assert "12.5" in page and "82.5" not in page
+    named = [stage for stage in re.findall(r"<tr><td>(\w+)</td>", page) if stage in STAGES]
+    assert named == sorted(named, key=STAGES.index)
+    assert {"match_pairs", "build_view_graph", "adjust_bundle"} < set(named)
     assert "relative pose AUC" in page
     assert page.count("<title>") >= 2 * 8
     assert "http" not in page.replace("http-equiv", "")

@@ -223,9 +223,10 @@ def test_the_map_is_seen_from_above_with_the_first_axis_to_the_right() -> None:
     centers = np.array([[0.0, 0, 0], [10, 20, 0]])
     points = np.array([[5.0, 10, 3], [5, 10, 1], [5, 10, 2]])
     colors = np.array([[255, 0, 0], [0, 255, 0], [0, 0, 255]], np.uint8)
-    svg = scene_map(
+    svg, outside = scene_map(
         ["low", "high"], rotations, translation_of(rotations, centers), points, colors, np.eye(3)
     )
+    assert outside == 0
     marks = re.findall(r"translate\(([\d.]+) ([\d.]+)\) rotate\((-?\d+)\)", svg)
     (low_x, low_y, east), (high_x, high_y, north) = (map(float, mark) for mark in marks)
     assert (east, north) == (0, -90)
@@ -245,10 +246,10 @@ def test_the_map_shows_cameras_and_points(count) -> None:
     rotations, translations = problem.rotations[:count], problem.translations[:count]
     names = [f"<{k}>" for k in range(count)]
     colors = np.full(problem.points.shape, (250, 10, 20), np.uint8)
-    svg = scene_map(
+    svg, outside = scene_map(
         names, rotations, translations, problem.points, colors, view_axes(rotations, translations)
     )
-    assert svg.count("<path") == count
+    assert (svg.count("<path"), outside) == (count, 0)
     assert "&lt;0&gt;" in svg
     data = re.search(r"base64,([^\"]+)", svg)
     assert data is not None
@@ -262,7 +263,28 @@ def test_the_map_of_a_model_without_points_has_its_cameras() -> None:
     problem = make_problem(camera_count=5, point_count=100)
     axes = view_axes(problem.rotations, problem.translations)
     nothing = np.zeros((0, 3))
-    svg = scene_map(
+    svg, outside = scene_map(
         list("abcde"), problem.rotations, problem.translations, nothing, nothing.astype(np.uint8), axes
     )
-    assert svg.count("<path") == 5
+    assert (svg.count("<path"), outside) == (5, 0)
+
+
+@pytest.mark.parametrize(("distance", "count"), [(2.5, 0), (30.0, 2)])
+def test_cameras_far_from_all_others_are_outside_the_map(distance: float, count: int) -> None:
+    rng = np.random.default_rng(0)
+    centers = rng.uniform(-1, 1, (60, 3))
+    centers[:2, 0] = distance, -distance
+    rotations = np.tile(np.eye(3), (60, 1, 1))
+    names = [f"{k}.jpg" for k in range(60)]
+    points, colors = rng.uniform(-1, 1, (500, 3)), np.zeros((500, 3), np.uint8)
+    svg, outside = scene_map(
+        names, rotations, translation_of(rotations, centers), points, colors, np.eye(3)
+    )
+    assert outside == count
+    places = re.findall(r"translate\((-?[\d.]+) (-?[\d.]+)\)", svg)
+    width = float(re.search(r'viewBox="0 0 (\d+)', svg)[1])
+    shown = [0 <= float(x) <= width for x, _ in places]
+    assert shown.count(False) == count
+    # however far the far ones are, the others take up a third of the map
+    spread = np.ptp([float(x) for x, _ in places[2:]]) / width
+    assert spread == pytest.approx(1 / 3, abs=0.04)

@@ -7,7 +7,8 @@ import sys
 
 import pytest
 
-from snakesfm.config.configuration import STAGES, options_class
+from snakesfm.config.configuration import options_class
+from snakesfm.pipeline import STAGES
 from snakesfm.stages.job import JobOptions
 
 HEAVY = (

@@ -199,7 +199,7 @@ def test_only_what_is_wanted_is_gathered(made, scene):
 
 
 def test_models_are_exported_side_by_side_and_the_first_is_evaluated(made, scene, tmp_path):
-    settings = {"images": str(tmp_path), "reference": ""}
+    settings = {"images": str(tmp_path), "intrinsics": "fixed", "reference": ""}
     files = ("sparse/0/images.bin", "summary.json")
     options = ExportModelOptions(link_images=False)
     run(export_model, options, scene, *(tmp_path / file for file in files), **settings)
@@ -222,7 +222,8 @@ def test_models_that_are_gone_leave_no_folder(scene, tmp_path):
     (tmp_path / "sparse" / "7").mkdir(parents=True)
     files = ("sparse/0/images.bin", "summary.json")
     options = ExportModelOptions(link_images=False)
-    run(export_model, options, scene, *(tmp_path / file for file in files), images=str(tmp_path))
+    settings = {"images": str(tmp_path), "intrinsics": "fixed"}
+    run(export_model, options, scene, *(tmp_path / file for file in files), **settings)
     assert sorted(path.name for path in (tmp_path / "sparse").iterdir()) == ["0", "1"]
 
 
