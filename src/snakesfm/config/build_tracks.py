@@ -20,6 +20,3 @@ class BuildTracksOptions(StageOptions):
 
     merge_radius_px: float = Field(default=1.0, ge=0.0, le=20.0)
     """Keypoints of one image closer together than this count as one observation of a track."""
-
-    split_conflicts: bool = False
-    """Split a track that sees an image twice at its weakest link; otherwise the track is dropped."""

@@ -46,7 +46,6 @@ def run(job: StageJob) -> None:
         min_length=min_length,
         sparse_observations=options.sparse_observations,
         merge_radius_px=options.merge_radius_px,
-        split=options.split_conflicts,
     )
     count = len(tracks.offsets) - 1
     if count == 0:
@@ -54,7 +53,7 @@ def run(job: StageJob) -> None:
         least = 2 if options.sparse_observations else min_length
         raise SceneError(
             f"Scene '{job.scene}': no point is seen in {least} images along the {len(pairs)} kept image "
-            + _remedies(least, 0 if options.split_conflicts else tracks.conflicts)
+            + _remedies(least, tracks.conflicts)
         )
     lengths = np.diff(tracks.offsets)
     print(
@@ -69,7 +68,7 @@ def run(job: StageJob) -> None:
             keypoints, pairs, offsets, matches, lambda i, j: found[i, j]
         )
         print(f"before merging keypoints: {describe_lengths(unmerged)}")
-        print(f"after merging keypoints: {describe_lengths(merged)}, before any is split or left out")
+        print(f"after merging keypoints: {describe_lengths(merged)}, before any is left out")
     base = offsets_of([len(k) for k in keypoints])
     rows = base[tracks.image_ids] + tracks.keypoint_ids
     TrackTable(
@@ -89,8 +88,6 @@ def _remedies(least: int, dropped: int) -> str:
     remedies = ["add images with more overlap"]
     if least > 2:
         remedies.append("lower build_tracks.min_length")
-    if dropped:
-        remedies.append("set build_tracks.split_conflicts: true")
     left_out = f" (left out as they see one image at two places: {dropped})" if dropped else ""
     return f"pairs{left_out}: {' or '.join(remedies)}."
 

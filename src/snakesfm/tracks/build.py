@@ -6,7 +6,7 @@ import numpy as np
 
 from snakesfm.arrays import Array
 from snakesfm.grouping import components_of, offsets_of
-from snakesfm.tracks.split import cycle_support, split_conflicts, unconfirmed_links
+from snakesfm.tracks.confirmation import unconfirmed_links
 
 
 @dataclass(frozen=True)
@@ -36,16 +36,14 @@ def build_tracks(
     matches: Array,
     min_length: int = 3,
     merge_radius_px: float = 1.0,
-    split: bool = False,
     sparse_observations: int = 0,
 ) -> Tracks:
     """Join matches to tracks that see each image at most once.
 
-    Connected components of the match graph. Those that see an image at two places are dropped, or split at
-    their weakest links (see :func:`snakesfm.tracks.split.split_conflicts`), a link's strength being the
-    number of 3-cycles that confirm it, then the matches of its pair. SIFT gives one place once per
-    dominant orientation; such keypoints make tracks of their own unless a match joins them. Without the
-    links of :func:`snakesfm.tracks.split.unconfirmed_links` a track falls into parts.
+    Connected components of the match graph. Those that see an image at two places are dropped. SIFT gives
+    one place once per dominant orientation; such keypoints make tracks of their own unless a match joins
+    them. Without the links of :func:`snakesfm.tracks.confirmation.unconfirmed_links` a track falls into
+    parts.
 
     Parameters
     ----------
@@ -55,7 +53,6 @@ def build_tracks(
     matches : (M,2) int, keypoint rows in image i and in image j.
     min_length : images that a track must be seen in.
     merge_radius_px : keypoints of one image within this distance are one observation.
-    split : split conflicting components; otherwise they are dropped.
     sparse_observations : an image with fewer observations of such tracks keeps its shorter ones too.
 
     Returns
@@ -63,17 +60,13 @@ def build_tracks(
     Tracks sorted by their first observation.
 
     Source: Moulon and Monasse, Unordered feature tracking made fast and easy, CVMP 2012, where components
-    in conflict are dropped; parts, splitting and the exception for sparse images are this project's own.
+    in conflict are dropped; parts and the exception for sparse images are this project's own.
     """
     base = offsets_of([len(k) for k in keypoints])
-    counts = np.diff(offsets)
-    pair_of = np.repeat(np.arange(len(pairs)), counts)
+    pair_of = np.repeat(np.arange(len(pairs)), np.diff(offsets))
     links = np.stack([base[pairs[pair_of, side]] + matches[:, side] for side in (0, 1)], axis=1)
-    # equal links are of one pair, so any of them will do
-    keys = links[:, 0] * base[-1] + links[:, 1]
-    kept = np.argsort(keys)
-    kept = kept[np.diff(keys[kept], prepend=-1) != 0]
-    links, weights = links[kept], counts[pair_of[kept]]
+    keys = np.unique(links[:, 0] * base[-1] + links[:, 1])
+    links = np.stack([keys // base[-1], keys % base[-1]], axis=1)
 
     matched = np.zeros(base[-1], dtype=bool)
     matched[links] = True
@@ -85,15 +78,7 @@ def build_tracks(
     positions = np.concatenate(keypoints)[nodes] if len(nodes) else np.zeros((0, 2))
     in_conflict = _conflicting(labels, images, positions, merge_radius_px)
     conflicts = len(np.unique(labels[in_conflict]))
-    if not split:
-        labels[in_conflict] = -1
-    elif conflicts:
-        inside = in_conflict[links[:, 0]]
-        rows, sub = np.unique(links[inside], return_inverse=True)
-        sub = sub.reshape(-1, 2).astype(np.int64)
-        strengths = np.stack([cycle_support(sub, len(rows)), weights[inside]], axis=1)
-        apart = split_conflicts(sub, strengths, images[rows], positions[rows], merge_radius_px)
-        labels[rows] = labels.max() + 1 + apart
+    labels[in_conflict] = -1
     observed = _one_per_image(labels, images, np.bincount(links.ravel(), minlength=len(nodes)))
     labels, parts, images = labels[observed], parts[observed], images[observed]
     rows = nodes[observed] - base[images]

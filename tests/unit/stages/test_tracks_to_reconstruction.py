@@ -198,7 +198,7 @@ def test_keypoints_are_merged_within_detector_pixels(made, inputs, tmp_path, cap
     )
 
 
-def test_where_every_track_sees_an_image_twice_splitting_is_advised(inputs):
+def test_where_every_track_sees_an_image_twice_it_is_told(inputs):
     for path in inputs["geometries"]:
         # every match of a pair is joined with the next one
         tile = TwoViewGeometries.read(path)
@@ -212,11 +212,9 @@ def test_where_every_track_sees_an_image_twice_splitting_is_advised(inputs):
         joined = joined[np.argsort(pair_of, kind="stable")]
         offsets = np.r_[0, np.cumsum(np.bincount(pair_of, minlength=len(tile.pairs)))]
         replace(tile, inliers=joined, offsets=offsets).write(path, HEADER)
-    told = r"in 2 images .* pairs \(.*two places: 1\): add .*overlap or set build_tracks\.split_conflicts: true\.$"
+    told = r"in 2 images .* pairs \(.*two places: 1\): add .*overlap\.$"
     with pytest.raises(SceneError, match=told):
         run(build_tracks, BuildTracksOptions(), inputs, inputs["tracks"])
-    run(build_tracks, BuildTracksOptions(split_conflicts=True), inputs, inputs["tracks"])
-    assert len(TrackTable.read(inputs["tracks"]).offsets) > 2
 
 
 def test_poses_that_fit_nothing_are_named(inputs):

@@ -1,4 +1,4 @@
-"""Splitting of components at unconfirmed links, and where they contain two points of one image."""
+"""Which links between matched keypoints 3-cycles confirm."""
 
 import numpy as np
 
@@ -70,60 +70,3 @@ def unconfirmed_links(links: Array, images: Array) -> Array:
     part = components_of(count, pairs[:, pair_rule].T)
     rule = pair_rule | (image_rule[pairs].all(axis=0) & (part[pairs[0]] == part[pairs[1]]))
     return np.asarray(doubtful & rule[pair_of])
-
-
-def split_conflicts(
-    links: Array, strengths: Array, images: Array, positions: Array, merge_radius_px: float
-) -> Array:
-    """Join nodes by decreasing strength of the links, never two places of one image.
-
-    Kruskal's algorithm on the match graph with a refused union where it would put two keypoints of one
-    image into a track; what is cut is thus the weakest link between them.
-
-    Parameters
-    ----------
-    links : (M,2) int64, nodes in 0 .. K-1.
-    strengths : (M,) or (M,S), larger is stronger; columns in order of their weight.
-    images : (K,) image of each node.
-    positions : (K,2), pixels; two nodes of an image within ``merge_radius_px`` are one place.
-    merge_radius_px : pixels.
-
-    Returns
-    -------
-    (K,) int64: the label of each node's track, the lowest node in it.
-    """
-    keys = strengths.reshape(len(links), -1)
-    columns = [-keys[:, column] for column in range(keys.shape[1])]
-    order = np.lexsort((links[:, 1], links[:, 0], *columns[::-1]))
-    places = positions.astype(np.float64).tolist()
-    radius2 = merge_radius_px**2
-    parent = list(range(len(images)))
-    members: list[dict[int, list[int]]] = [{image: [node]} for node, image in enumerate(images.tolist())]
-
-    def find(node: int) -> int:
-        while parent[node] != node:
-            parent[node] = parent[parent[node]]
-            node = parent[node]
-        return node
-
-    def apart(a: int, b: int) -> bool:
-        return bool((places[a][0] - places[b][0]) ** 2 + (places[a][1] - places[b][1]) ** 2 > radius2)
-
-    for first, second in links[order].tolist():
-        a, b = find(first), find(second)
-        if a == b:
-            continue
-        if len(members[a]) < len(members[b]):
-            a, b = b, a
-        large, small = members[a], members[b]
-        shared = [image for image in small if image in large]
-        if any(apart(x, y) for image in shared for x in small[image] for y in large[image]):
-            continue
-        for image, nodes in small.items():
-            large.setdefault(image, []).extend(nodes)
-        small.clear()
-        parent[b] = a
-    roots = np.array([find(node) for node in range(len(images))], dtype=np.int64)
-    lowest = np.full(len(images), len(images), dtype=np.int64)
-    np.minimum.at(lowest, roots, np.arange(len(images)))
-    return lowest[roots]
