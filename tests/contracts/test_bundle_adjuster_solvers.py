@@ -112,15 +112,6 @@ class BundleAdjusterContract:
         assert abs(camera.params[3]) < 1e-4
         assert 1.0 < abs(camera.params[0] - 510.0) < 50.0
 
-    def test_held_rotations_stay(self, adjust):
-        _, model, reconstruction = scene(noise_px=0.3)
-        before, after = adjust(
-            reconstruction, SolverSettings(constant_cameras=frozenset([1]), constant_rotations=True)
-        )
-        result, _ = from_reconstruction(reconstruction, model)
-        assert after < before
-        np.testing.assert_allclose(result.rotations, model.rotations, atol=1e-5)
-
     def test_one_image_or_no_point_is_left_alone(self, adjust):
         made, model, _ = scene()
         alone = to_reconstruction(

@@ -59,7 +59,7 @@ from snakesfm.errors import ConfigError
         ({"average_translations": {"edge_weight": float("inf")}}, ["edge_weight' = inf: ", "1000000"]),
         ({"average_rotations": {"min_component_images": 2}}, ["_images' = 2: ", "equal to 3."]),
         ({"export_model": {"georeference": "maybe"}}, ["= 'maybe': ", "be true or false (or 'auto')."]),
-        ({"adjust_bundle": {"rotations_first": "often"}}, ["= 'often': ", "be true or false."]),
+        ({"adjust_bundle": {"complete_tracks": "often"}}, ["= 'often': ", "be true or false."]),
         ({"adjust_bundle": {"loss_scale_px": "many"}}, ["= 'many': ", "be a number (or 'auto')."]),
         (
             {"extract_features": None, "max_keypoints": 3},

@@ -39,7 +39,6 @@ def _options(settings: SolverSettings) -> pycolmap.BundleAdjustmentOptions:
     options.refine_focal_length = settings.refine_focal
     options.refine_extra_params = settings.refine_distortion
     options.refine_principal_point = settings.refine_principal_points
-    options.constant_rig_from_world_rotation = settings.constant_rotations
     ceres = options.ceres
     ceres.use_gpu = False
     ceres.max_num_images_direct_sparse_cpu_solver = FACTORED_IMAGES

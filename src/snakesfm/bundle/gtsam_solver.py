@@ -13,7 +13,6 @@ from snakesfm.geometry.poses import to_rigid3d
 
 TIGHT, FREE = 1e-6, 1e6
 MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
-ROTATION_LOCK_RAD = 1e-7
 
 
 def adjust_gtsam(reconstruction: pycolmap.Reconstruction, settings: SolverSettings) -> tuple[float, float]:
@@ -141,11 +140,6 @@ def _fix_gauge(priors: Any, values: Any, images: list[int], settings: SolverSett
     priors.add(gtsam.PriorFactorPose3(_pose(images[0]), values.atPose3(_pose(images[0])), lock))
     along = gtsam.noiseModel.Isotropic.Sigma(1, TIGHT * scale)
     priors.add(gtsam.RangeFactorPose3(_pose(images[0]), _pose(far), scale, along))
-    if settings.constant_rotations:
-        sigmas = np.r_[np.full(3, ROTATION_LOCK_RAD), np.full(3, FREE * scale)]
-        turned = gtsam.noiseModel.Diagonal.Sigmas(sigmas)
-        for image_id in images[1:]:
-            priors.add(gtsam.PriorFactorPose3(_pose(image_id), values.atPose3(_pose(image_id)), turned))
 
 
 def _optimize(graph: Any, values: Any, settings: SolverSettings) -> Any:

@@ -17,7 +17,6 @@ class SolverSettings:
     constant_cameras : ids of cameras whose intrinsics are held.
     refine_focal, refine_distortion, refine_principal_points : which intrinsics of the others are free;
         gtsam holds principal points.
-    constant_rotations : hold all rotations.
     max_iterations, function_tolerance : when the solver stops.
     inner_iterations : Ceres adjusts points and cameras by turns after each step: fewer, but dearer ones.
     """
@@ -28,7 +27,6 @@ class SolverSettings:
     refine_focal: bool = True
     refine_distortion: bool = True
     refine_principal_points: bool = False
-    constant_rotations: bool = False
     max_iterations: int = 100
     function_tolerance: float = 1e-6
     inner_iterations: bool = True

@@ -21,13 +21,11 @@ class RoundSettings:
 
     solver: Solver
     thresholds_px: tuple[float, ...]
-    rotations_first: bool
     loss_scale_px: float | Literal["auto"]
     loss_scale_sigmas: float
     early_loss_share: float
     last_loss: Loss
     outlier_sigmas: float
-    distortion_from_round: int
     refine_principal_points: bool
     max_principal_point_gap: float
     min_principal_point_offset: float

@@ -69,8 +69,6 @@ def adjust_rounds(
     """
     mapper = _Mapper(reconstruction, read_graph, cameras, solving, settings, report)
     last = len(settings.thresholds_px) - 1
-    if settings.rotations_first:
-        mapper.round("rotations fixed", settings.thresholds_px[0] * 2, "early", number=0)
     for row, threshold in enumerate(settings.thresholds_px):
         number = row + 1
         phase: Phase = "final" if row == last else "early"
@@ -78,10 +76,11 @@ def adjust_rounds(
         # what completion adds is not refined, so it ends where refinement begins
         completing = bool(row) and settings.complete_tracks and (not sources or row < last)
         mapper.prepare(completing, refining)
-        mapper.round(f"round {number}", threshold, phase, number)
-        if row == max(last - 1, 0) and mapper.widen_lenses(number):
+        mapper.round(f"round {number}", threshold, phase, holds_distortion=number == 1)
+        # before that, distortion was held
+        if 0 < row == last - 1 and mapper.widen_lenses():
             mapper.prepare(completing, refining)
-            mapper.round(f"round {number} with wider lenses", threshold, phase, number)
+            mapper.round(f"round {number} with wider lenses", threshold, phase)
     while settings.register_images and mapper.register():
         mapper.round("registration", settings.thresholds_px[-1], "final")
     if settings.refine_principal_points and settings.solver == "ceres":
@@ -119,15 +118,15 @@ class _Mapper:
         self.adjust = bundle_adjuster(settings.solver)
         self.held_graph: pycolmap.CorrespondenceGraph | None = None
 
-    def round(self, name: str, threshold_px: float, phase: Phase, number: int = 0) -> None:
+    def round(self, name: str, threshold_px: float, phase: Phase, holds_distortion: bool = False) -> None:
         """One pass of the solver and the filters after it; all but the last are coarse.
 
-        Early rounds of a low number hold the distortion, which would make up for a wrong focal length. A
-        camera gone wild is held until the pass ends: the next one starts from better poses and points.
+        An early one may hold the distortion, which would make up for a wrong focal length. A camera gone
+        wild is held until the pass ends: the next one starts from better poses and points.
         """
         settings = self.settings
         if phase == "early":
-            solving = self.early_solving(threshold_px, number)
+            solving = self.early_solving(threshold_px, holds_distortion)
         else:
             # the solver takes most memory here, and few models need their matches again
             self.held_graph = None
@@ -139,8 +138,8 @@ class _Mapper:
             deregister_weak_images(self.reconstruction, settings.min_observations)
         self.record(name, costs, wild, held)
 
-    def early_solving(self, threshold_px: float, number: int) -> SolverSettings:
-        """How a round before the final ones is solved; round 0 holds all rotations."""
+    def early_solving(self, threshold_px: float, holds_distortion: bool) -> SolverSettings:
+        """How a round before the final ones is solved."""
         settings, solving = self.settings, self.solving
         return replace(
             solving,
@@ -148,8 +147,7 @@ class _Mapper:
             loss_scale_px=settings.early_loss_share * threshold_px,
             # the few steps of a coarse pass cost less than these need to be prepared
             inner_iterations=False,
-            refine_distortion=solving.refine_distortion and number >= settings.distortion_from_round,
-            constant_rotations=number == 0,
+            refine_distortion=solving.refine_distortion and not holds_distortion,
         )
 
     def late_solving(self, phase: Literal["final", "last"]) -> SolverSettings:
@@ -195,11 +193,10 @@ class _Mapper:
             )
             source.release()
 
-    def widen_lenses(self, number: int) -> bool:
+    def widen_lenses(self) -> bool:
         """After a round, give cameras whose lens is not of their model a wider one; whether some were."""
         settings = self.settings
-        told = number >= settings.distortion_from_round
-        if not settings.widen_lenses or not told or settings.solver != "ceres":
+        if not settings.widen_lenses or settings.solver != "ceres":
             return False
         wider = find_wider_lenses(self.reconstruction, self.adjust, self.late_solving("final"))
         for camera_id, camera in wider.items():

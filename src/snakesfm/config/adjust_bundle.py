@@ -44,17 +44,11 @@ class AdjustBundleOptions(StageOptions):
     last_loss: Literal["huber", "cauchy", "squared"] = "huber"
     """Robust loss of the last pass, when far outliers are gone and larger errors may have more weight."""
 
-    rotations_first: bool = False
-    """Start with a pass that keeps the averaged rotations fixed."""
-
     refine_focal: bool = True
     """Refine the focal length of cameras that are not fixed."""
 
     refine_distortion: bool = True
-    """Refine the distortion of cameras that are not fixed."""
-
-    distortion_from_round: int = Field(default=2, ge=1)
-    """First round that refines distortion; the last round does so in any case."""
+    """Refine the distortion of cameras that are not fixed, from the second round on."""
 
     refine_principal_points: bool = True
     """At the end, refine the principal points of cameras that are not fixed, if the model determines

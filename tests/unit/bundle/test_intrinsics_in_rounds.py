@@ -34,24 +34,21 @@ def adjusted(solving=None, **changes):
     """The camera that the rounds find from a wrong focal length without distortion."""
     made = make_problem(12, 600, noise_px=0.2, camera=TRUE, seed=5)
     model = replace(true_model(made), cameras=(START,))
-    found, _ = run_rounds(made, model, solving, thresholds_px=(20.0, 5.0, 3.0), **changes)
+    found, _ = run_rounds(made, model, solving, **{"thresholds_px": (20.0, 5.0, 3.0)} | changes)
     return np.array(found.cameras[0].params)
 
 
-@pytest.mark.parametrize(("start", "rounds_with"), [(1, [1, 1, 1]), (2, [0, 1, 1]), (9, [0, 0, 1])])
-def test_distortion_is_held_in_the_rounds_before(passes, start, rounds_with):
-    params = adjusted(distortion_from_round=start)
-    assert [settings.refine_distortion for settings in passes[:3]] == rounds_with
+def test_distortion_is_held_in_the_first_round(passes):
+    params = adjusted()
+    assert [settings.refine_distortion for settings in passes[:3]] == [False, True, True]
     np.testing.assert_allclose(params[0], 500.0, rtol=0.01)
     np.testing.assert_allclose(params[3], -0.05, atol=0.01)
-    assert params[3] != 0.0
 
 
-@pytest.mark.parametrize(("start", "rounds_with"), [(1, [0, 1, 1, 1]), (2, [0, 0, 1, 1])])
-def test_the_pass_with_fixed_rotations_is_none_of_the_rounds_that_are_counted(passes, start, rounds_with):
-    adjusted(distortion_from_round=start, rotations_first=True)
-    assert [settings.constant_rotations for settings in passes[:4]] == [1, 0, 0, 0]
-    assert [settings.refine_distortion for settings in passes[:4]] == rounds_with
+def test_distortion_is_free_in_a_round_that_is_also_the_last(passes):
+    params = adjusted(thresholds_px=(5.0,))
+    assert passes[0].refine_distortion
+    np.testing.assert_allclose(params[3], -0.05, atol=0.01)
 
 
 def test_distortion_stays_held_where_it_is_switched_off(passes):

@@ -52,11 +52,10 @@ def test_a_fisheye_lens_is_found_out_and_the_model_is_right() -> None:
         # of points within 45 degrees of the axis the wider model leaves more than half of the errors
         {"true": FISHEYE, "layout": "ring"},
         {"true": FISHEYE, "held": frozenset([1])},
-        {"true": FISHEYE, "distortion_from_round": 3},
-        {"true": FISHEYE, "distortion_from_round": 3, "rotations_first": True},
+        {"true": FISHEYE, "thresholds_px": (20.0, 3.0)},
         {"true": FISHEYE, "widen_lenses": False},
     ],
-    ids=["its own", "hardly better", "held", "distortion still held", "rotations first", "switched off"],
+    ids=["its own", "hardly better", "held", "distortion still held", "switched off"],
 )
 def test_other_lenses_keep_their_model(case) -> None:
     camera, names, _ = adjusted(**case)
