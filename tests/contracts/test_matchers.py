@@ -188,7 +188,7 @@ class MutualRatioContract(MatcherContract):
 
 
 class TestExactMutualRatio(MutualRatioContract):
-    options: ClassVar = {"search": "exact"}
+    options: ClassVar = {"words": 1}
 
     def test_agrees_with_the_definition(self):
         rng = np.random.default_rng(4)
@@ -198,7 +198,7 @@ class TestExactMutualRatio(MutualRatioContract):
         ordered = np.sort(distance, axis=1)
         nearest = distance.argmin(axis=1)
         good = (ordered[:, 0] <= 0.8 * ordered[:, 1]) & (distance.argmin(axis=0)[nearest] == np.arange(613))
-        matcher = MATCHERS["mutual_ratio"](search="exact", max_ratio=0.8)
+        matcher = MATCHERS["mutual_ratio"](words=1, max_ratio=0.8)
         matches, scores = self.match(matcher, keypoints(first), keypoints(second.astype(np.uint8)))
         np.testing.assert_array_equal(matches[:, 0], np.flatnonzero(good))
         np.testing.assert_array_equal(matches[:, 1], nearest[good])
@@ -206,11 +206,11 @@ class TestExactMutualRatio(MutualRatioContract):
 
 
 class TestClusteredMutualRatio(MutualRatioContract):
-    options: ClassVar = {"search": "clustered"}
+    options: ClassVar = {}
 
 
 class TestClusteredMutualRatioOfManyWords(MutualRatioContract):
-    options: ClassVar = {"search": "clustered", "words": 256, "probes": 4.5}
+    options: ClassVar = {"words": 256, "probes": 4.5}
 
 
 class TestVirtual(MatcherContract):

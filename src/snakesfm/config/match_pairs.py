@@ -29,12 +29,9 @@ class MatchPairsOptions(StageOptions):
     """Largest ratio of the distances to the nearest and the second nearest descriptor; 1 turns the test
     off."""
 
-    search: Literal["clustered", "exact"] = "clustered"
-    """Search for nearest descriptors among those with similar words (much faster), or among all."""
-
     words: int = Field(32, ge=1, le=256)
-    """Number of words in the codebook that clustered search learns on each image; fewer if it has few
-    keypoints."""
+    """Number of words in the codebook learned on each image; nearest descriptors are searched among those
+    with similar words. Fewer if the image has few keypoints; 1 searches among all, several times slower."""
 
     probes: float = Field(3.0, ge=1.0, le=256.0)
     """Number of words that a descriptor is compared with, on average over an image; more find more

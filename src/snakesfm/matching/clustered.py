@@ -28,7 +28,7 @@ class ClusteredSearch:
 
     The codebook is learned from this image alone by a fixed rule: the matches of a pair depend on nothing
     but the pair. With uint8 descriptors centres are integers and every product is exact in float32,
-    whatever the BLAS. Where all words are probed the matches are those of the exact search. Memory: about
+    whatever the BLAS. Where all words are probed, as with a single one, the search is exact. Memory: about
     ``4 * (probes + 2) * N * D`` bytes for N descriptors, and two float32 copies of the other image's.
 
     Parameters

@@ -2,14 +2,13 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 from snakesfm.arrays import Array
 from snakesfm.features.keypoints import KeypointSet
 from snakesfm.lazy_loading import lazy
 from snakesfm.matching.clustered import ClusteredSearch
 from snakesfm.matching.identity import IdentityMatcher
-from snakesfm.matching.nearest import ExactSearch
 
 
 class Matcher(Protocol):
@@ -46,26 +45,22 @@ class MutualRatioMatcher:
     Parameters
     ----------
     max_ratio : as in :func:`snakesfm.matching.nearest.accept`.
-    search : compare all descriptors, or those of like words.
     words, probes : as in :meth:`snakesfm.matching.clustered.ClusteredSearch.build`.
     """
 
     max_ratio: float = 0.8
-    search: Literal["clustered", "exact"] = "clustered"
     words: int = 32
     probes: float = 3.0
 
-    def prepare(self, first: KeypointSet) -> ClusteredSearch | ExactSearch:
+    def prepare(self, first: KeypointSet) -> ClusteredSearch:
         """See :class:`Matcher`."""
-        if self.search == "exact":
-            return ExactSearch.build(first.descriptors)
         return ClusteredSearch.build(first.descriptors, self.words, self.probes)
 
     def prepare_second(self, second: KeypointSet) -> Array:
         """See :class:`Matcher`."""
         return second.descriptors
 
-    def match(self, first: ClusteredSearch | ExactSearch, second: Array) -> tuple[Array, Array]:
+    def match(self, first: ClusteredSearch, second: Array) -> tuple[Array, Array]:
         """See :class:`Matcher`."""
         return first.match(second, self.max_ratio)
 

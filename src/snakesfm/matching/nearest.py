@@ -1,52 +1,8 @@
-"""Mutual nearest neighbours with the ratio test, as one blocked matrix product."""
-
-from dataclasses import dataclass
+"""Steps of the search for mutual nearest neighbours, and the ratio test."""
 
 import numpy as np
 
 from snakesfm.arrays import Array
-
-# a block of products then stays in the processor's second and third cache
-ROWS_AT_ONCE = 256
-
-
-@dataclass(frozen=True)
-class ExactSearch:
-    """The descriptors of one image, ready to be matched with those of others.
-
-    All of -|a-b|^2/2 comes out of one matrix product with two extra columns, block by block of rows; the
-    nearest of every column is carried along, so there is no second product for the way back. On uint8
-    descriptors of moderate length (512 x RootSIFT) every sum is an integer or a half that float32 holds
-    exactly: the result depends neither on the blocks nor on the BLAS.
-
-    Parameters
-    ----------
-    vectors : (N,D+2) float32, as :func:`augmented` makes them.
-    """
-
-    vectors: Array
-
-    @classmethod
-    def build(cls, descriptors: Array) -> "ExactSearch":
-        """Prepare the descriptors (N,D) of an image, any real dtype."""
-        return cls(augmented(descriptors, norm_first=True))
-
-    def match(self, descriptors: Array, max_ratio: float) -> tuple[Array, Array]:
-        """Match with the descriptors (M,D) of another image; arguments and results as in :func:`accept`."""
-        left, right = self.vectors, augmented(descriptors, norm_first=False).T
-        count, others = len(left), len(descriptors)
-        if count < 2 or others < 2:
-            return no_matches()
-        nearest = np.empty(count, np.int64)
-        first, second = np.empty(count, np.float32), np.empty(count, np.float32)
-        column_first = np.full(others, -np.inf, np.float32)
-        buffer = np.empty((min(ROWS_AT_ONCE, count), others), np.float32)
-        for start in range(0, count, ROWS_AT_ONCE):
-            rows = slice(start, min(start + ROWS_AT_ONCE, count))
-            block = np.matmul(left[rows], right, out=buffer[: rows.stop - start])
-            np.maximum(column_first, block.max(axis=0), out=column_first)
-            nearest[rows], first[rows], second[rows] = pop_two_largest(block)
-        return accept(nearest, first, second, column_first, max_ratio)
 
 
 def augmented(descriptors: Array, norm_first: bool) -> Array:

@@ -107,7 +107,7 @@ def _create_matcher(job: StageJob, options: "MatchPairsOptions") -> Matcher:
     if options.method == "virtual":
         return MATCHERS["virtual"]()
     if options.method == "mutual_ratio":
-        names = {"max_ratio", "search", "words", "probes"}
+        names = {"max_ratio", "words", "probes"}
         return MATCHERS["mutual_ratio"](**options.model_dump(include=names))
     detector = str(job.settings.get("detector", "sift"))
     return MATCHERS[options.method](

@@ -4,7 +4,6 @@ import pytest
 from snakesfm.features.sift import rootsift
 from snakesfm.matching import clustered
 from snakesfm.matching.clustered import ClusteredSearch, learn_small_codebook
-from snakesfm.matching.nearest import ExactSearch
 
 RATIO = 0.8
 
@@ -23,6 +22,11 @@ def scene(seed, first=1500, second=1300, shared=600, kinds=40):
     return rootsift(points[:first].astype(np.float32)), rootsift(others[order].astype(np.float32)), truth
 
 
+def exact_search(descriptors):
+    """All descriptors have the same word; a contract compares this with the definition."""
+    return ClusteredSearch.build(descriptors, words=1, probes=1)
+
+
 def as_set(matches):
     return set(map(tuple, matches.tolist()))
 
@@ -32,7 +36,7 @@ def test_finds_nearly_all_that_exact_search_finds_and_little_else():
     for seed in range(4):
         first, second, truth = scene(seed)
         true = {(row, int(column)) for row, column in enumerate(truth)}
-        exact = as_set(ExactSearch.build(first).match(second, RATIO)[0])
+        exact = as_set(exact_search(first).match(second, RATIO)[0])
         found = as_set(ClusteredSearch.build(first, 16, 2).match(second, RATIO)[0])
         hit += len(exact & found & true)
         right, wrong = right + len(found & true), wrong + len(found - true)
@@ -46,7 +50,7 @@ def test_finds_nearly_all_that_exact_search_finds_and_little_else():
 
 def test_more_probes_find_more():
     first, second, _ = scene(7)
-    exact = as_set(ExactSearch.build(first).match(second, RATIO)[0])
+    exact = as_set(exact_search(first).match(second, RATIO)[0])
     found = [
         len(exact & as_set(ClusteredSearch.build(first, 16, probes).match(second, RATIO)[0]))
         for probes in (1, 2, 4, 16)
@@ -54,10 +58,10 @@ def test_more_probes_find_more():
     assert found[0] < found[1] <= found[2] <= found[3] == len(exact)
 
 
-@pytest.mark.parametrize(("words", "probes"), [(1, 1), (16, 16), (16, 99)])
+@pytest.mark.parametrize(("words", "probes"), [(16, 16), (16, 99)])
 def test_probing_all_words_is_exact(words, probes):
     first, second, _ = scene(3)
-    expected = ExactSearch.build(first).match(second, RATIO)
+    expected = exact_search(first).match(second, RATIO)
     for one, other in zip(
         expected, ClusteredSearch.build(first, words, probes).match(second, RATIO), strict=True
     ):
@@ -106,7 +110,7 @@ def test_largest_descriptors_stay_exact():
     second = np.where(rng.random((1500, 128)) < 0.1, rng.integers(200, 256, (1500, 128)), first)
     second = second.astype(np.uint8)
     for matches, _ in (
-        ExactSearch.build(first).match(second, RATIO),
+        exact_search(first).match(second, RATIO),
         ClusteredSearch.build(first, 16, 16).match(second, RATIO),
     ):
         np.testing.assert_array_equal(matches, np.column_stack([np.arange(1500)] * 2))
@@ -115,7 +119,7 @@ def test_largest_descriptors_stay_exact():
 def test_few_words_for_few_descriptors():
     first, second, _ = scene(6)
     assert len(ClusteredSearch.build(first[:200], 32, 3).centers) == 3
-    expected = ExactSearch.build(first[:200]).match(second, RATIO)
+    expected = exact_search(first[:200]).match(second, RATIO)
     for one, other in zip(
         expected, ClusteredSearch.build(first[:200], 32, 3).match(second, RATIO), strict=True
     ):

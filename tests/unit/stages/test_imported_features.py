@@ -123,7 +123,7 @@ def test_descriptors_that_are_not_finite_become_zeros_and_harm_neither_matching_
     assert first.dtype == np.float16
     whole = [row for row in range(300) if row not in (5, 7, 11)]
     for one, other in ((first, second), (second, first)):
-        matcher = MATCHERS["mutual_ratio"](max_ratio=0.8, search="clustered", words=32, probes=3.0)
+        matcher = MATCHERS["mutual_ratio"](max_ratio=0.8, words=32, probes=3.0)
         prepared = [
             KeypointSet(places, rows, places[:, 0], places[:, 0], places[:, 0]) for rows in (one, other)
         ]
