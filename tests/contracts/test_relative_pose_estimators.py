@@ -103,11 +103,6 @@ class TestOpencvGcransac(RelativePoseContract):
     max_error_deg = 2.0
 
 
-class TestOpencvMagsac(RelativePoseContract):
-    name = "opencv_magsac"
-    max_error_deg = 3.0
-
-
 class TestPycolmap(RelativePoseContract):
     name = "pycolmap"
     max_error_deg = 1.0

@@ -12,7 +12,7 @@ class EstimateTwoViewOptions(StageOptions):
 
     stage_version: ClassVar[int] = 6
 
-    estimator: Literal["poselib", "opencv_gcransac", "opencv_magsac", "pycolmap"] = "poselib"
+    estimator: Literal["poselib", "opencv_gcransac", "pycolmap"] = "poselib"
     """Robust estimator of the essential matrix."""
 
     max_error_px: float = Field(default=0.5, gt=0, le=20)

@@ -90,9 +90,13 @@ def estimate_poselib(
     return _robust_pose(pose.R, pose.t, np.array(info["inliers"], dtype=bool))
 
 
-def _estimate_usac(
-    points: Correspondences, max_error_px: float, max_iterations: int, seed: int, method: int
+def estimate_opencv_gcransac(
+    points: Correspondences, max_error_px: float, max_iterations: int, seed: int
 ) -> RobustPose | None:
+    """Graph-cut RANSAC of OpenCV's USAC (``USAC_ACCURATE``), the estimator of GTSfM.
+
+    Source: Barath and Matas, Graph-Cut RANSAC, CVPR 2018.
+    """
     if len(points) < MINIMAL_SAMPLE + 1:
         return None
     # USAC draws from a fixed state: the seed enters by the order of the points
@@ -105,7 +109,7 @@ def _estimate_usac(
             points_i,
             points_j,
             identity,
-            method=method,
+            method=cv2.USAC_ACCURATE,
             prob=CONFIDENCE,
             threshold=max_error_px / points.mean_focal,
             maxIters=max_iterations,
@@ -121,26 +125,6 @@ def _estimate_usac(
     inliers = np.zeros(len(points), dtype=bool)
     inliers[order] = found
     return _robust_pose(rotation, translation.ravel(), inliers)
-
-
-def estimate_opencv_gcransac(
-    points: Correspondences, max_error_px: float, max_iterations: int, seed: int
-) -> RobustPose | None:
-    """Graph-cut RANSAC of OpenCV's USAC (``USAC_ACCURATE``), the estimator of GTSfM.
-
-    Source: Barath and Matas, Graph-Cut RANSAC, CVPR 2018.
-    """
-    return _estimate_usac(points, max_error_px, max_iterations, seed, cv2.USAC_ACCURATE)
-
-
-def estimate_opencv_magsac(
-    points: Correspondences, max_error_px: float, max_iterations: int, seed: int
-) -> RobustPose | None:
-    """MAGSAC++ of OpenCV's USAC (``USAC_MAGSAC``).
-
-    Source: Barath et al., MAGSAC++, a fast, reliable and accurate robust estimator, CVPR 2020.
-    """
-    return _estimate_usac(points, max_error_px, max_iterations, seed, cv2.USAC_MAGSAC)
 
 
 def estimate_pycolmap(
@@ -174,6 +158,5 @@ def estimate_pycolmap(
 ESTIMATORS: dict[str, PoseEstimator] = {
     "poselib": estimate_poselib,
     "opencv_gcransac": estimate_opencv_gcransac,
-    "opencv_magsac": estimate_opencv_magsac,
     "pycolmap": estimate_pycolmap,
 }
