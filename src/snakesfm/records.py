@@ -82,19 +82,18 @@ def was_made_with(output: str, params: str, records: Path = RECORDS) -> bool:
     return repr(params) in noted
 
 
-def check_folder(snakefile: str, records: Path = RECORDS) -> None:
+def check_folder(snakefile: str) -> None:
     """Make sure that Snakemake can keep its records, without which it ends in a traceback.
 
     Parameters
     ----------
     snakefile : path of the Snakefile, to start it from elsewhere.
-    records : Snakemake's folder of records.
 
     Raises
     ------
     ConfigError : the folder that Snakemake was started in cannot be written.
     """
-    place = next(folder for folder in (records.parent, Path()) if folder.is_dir())
+    place = next(folder for folder in (RECORDS.parent, Path()) if folder.is_dir())
     if not os.access(place, os.W_OK, effective_ids=True):
         raise ConfigError(
             f"Snakemake keeps its records in '.snakemake' of the folder it is started in, and "

@@ -128,7 +128,7 @@ def choose_partners(pairs: Array, likenesses: Array, enough_partners: int, enoug
     kept = (places[order] < enough_partners) | (sums < enough_likeness)
     stays[rows[order[kept]]] = True
     left = np.flatnonzero(~stays)
-    closing = left[~_joined(pairs[left], pairs[stays], LOOP_STEPS)]
+    closing = left[~_joined(pairs[left], pairs[stays])]
     rows, _, ranks, _ = _ranked(pairs, likenesses, closing)
     stays[rows[ranks < max(1, enough_partners // 10)]] = True
     return stays
@@ -142,8 +142,8 @@ def _ranked(pairs: Array, likenesses: Array, rows: Array) -> tuple[Array, Array,
     return np.tile(rows, 2), images, ranks, values
 
 
-def _joined(pairs: Array, kept: Array, steps: int) -> Array:
-    """Whether at most so many of the kept pairs (K,2) lead from one image of a pair (P,2) to the other."""
+def _joined(pairs: Array, kept: Array) -> Array:
+    """Whether at most ``LOOP_STEPS`` kept pairs (K,2) lead from one image of a pair (P,2) to the other."""
     if len(pairs) == 0:
         return np.zeros(0, bool)
     count = 1 + int(max(pairs.max(), kept.max(initial=0)))
@@ -154,7 +154,7 @@ def _joined(pairs: Array, kept: Array, steps: int) -> Array:
     own = np.zeros((count, -(-count // 8)), np.uint8)
     np.bitwise_or.at(own, (both[:, 0], both[:, 1] // 8), (128 >> both[:, 1] % 8).astype(np.uint8))
     reached = own
-    for _ in range(steps - 1):
+    for _ in range(LOOP_STEPS - 1):
         reached = np.stack([np.bitwise_or.reduce(reached[rows], axis=0) for rows in partners])
     first, second = pairs.T
     joined: Array = reached[first, second // 8] & (128 >> second % 8).astype(np.uint8) > 0

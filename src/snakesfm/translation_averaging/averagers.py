@@ -12,7 +12,6 @@ from snakesfm.translation_averaging.problem import PositioningProblem
 from snakesfm.translation_averaging.scale_chain import chain_centers
 from snakesfm.view_graph.components import label_components
 
-HUBER_SIGMAS = 1.345
 LARGEST_SCALE_GAP = 10.0
 LEAST_SHARE_AT_ONE_SCALE = 0.9
 
@@ -76,11 +75,11 @@ class TranslationRecovery:
         if self.reject_outliers == "mfas" and len(problem.pairs):
             keep = mfas_weights(problem, self.mfas_projections, seed) < self.mfas_weight
             problem = problem.select_edges(keep)
-        centers = recover_translations(problem, self.sigma, HUBER_SIGMAS, seed)
+        centers = recover_translations(problem, self.sigma, seed)
         if self.reject_outliers == "residual":
             keep = ~(edge_angles_rad(problem, centers) > self.residual_rad)
             if not keep.all():
-                centers = recover_translations(problem.select_edges(keep), self.sigma, HUBER_SIGMAS, seed)
+                centers = recover_translations(problem.select_edges(keep), self.sigma, seed)
         chained = self.chain.link(whole) if self.chain else None
         if chained is None:
             return centers

@@ -8,14 +8,16 @@ import numpy as np
 from snakesfm.arrays import Array
 from snakesfm.translation_averaging.problem import PositioningProblem
 
+HUBER_SIGMAS = 1.345
 
-def recover_translations(problem: PositioningProblem, sigma: float, huber: float, seed: int) -> Array:
+
+def recover_translations(problem: PositioningProblem, sigma: float, seed: int) -> Array:
     """Centres (N,3), landmarks being further unknowns; NaN for images without edges or rays.
 
-    ``sigma`` is that of the chordal residual of a direction, ``huber`` the loss's threshold in sigmas.
+    ``sigma`` is that of the chordal residual of a direction.
     """
     noise = gtsam.noiseModel.Robust.Create(
-        gtsam.noiseModel.mEstimator.Huber.Create(huber), gtsam.noiseModel.Isotropic.Sigma(2, sigma)
+        gtsam.noiseModel.mEstimator.Huber.Create(HUBER_SIGMAS), gtsam.noiseModel.Isotropic.Sigma(2, sigma)
     )
     measurements = _measurements(problem, noise)
     rows = zip(problem.ray_images.tolist(), problem.ray_tracks.tolist(), problem.rays, strict=True)

@@ -259,13 +259,13 @@ def _rotation_alone(
     Parallax bends a rotation alone, far beyond its covariance. It must agree with the pose with a direction
     under the covariance of that, and what their difference exceeds chance by is added to its own.
     """
-    first, _ = fit_rotation(points.take(inliers), refined.rotation, 1.0, SIGMA_FLOOR_PX)
+    first, _ = fit_rotation(points.take(inliers), refined.rotation, SIGMA_FLOOR_PX)
     errors = np.linalg.norm(transfer_errors_px(points, first), axis=1)
     if np.count_nonzero(errors[inliers] < selection_px) < options.planar_ratio * len(inliers):
         return None
     # inliers of the pose with a direction lie one way along their epipolar lines, and mismatches far along
     rows = unique_matches(matches, errors, errors < selection_px)
-    rotation, covariance = fit_rotation(points.take(rows), first, 1.0, SIGMA_FLOOR_PX)
+    rotation, covariance = fit_rotation(points.take(rows), first, SIGMA_FLOOR_PX)
     bend = log_so3(rotation @ refined.rotation.T)
     squared = float(bend @ np.linalg.solve(refined.covariance[:3, :3], bend))
     if squared > MAX_BEND_SQUARED * max(1.0, SURE_INLIERS / len(inliers)) ** 2:

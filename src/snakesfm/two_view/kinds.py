@@ -76,13 +76,11 @@ def transfer_errors_px(points: Correspondences, rotation: Array) -> Array:
     return np.nan_to_num(errors, nan=1e6)
 
 
-def fit_rotation(
-    points: Correspondences, rotation: Array, loss_scale: float, floor_px: float
-) -> tuple[Array, Array]:
+def fit_rotation(points: Correspondences, rotation: Array, floor_px: float) -> tuple[Array, Array]:
     """The rotation (3,3) alone that explains the correspondences best, and its covariance (3,3) in rad^2.
 
     Gauss-Newton on the Cauchy loss of the transfer error, from a nearby rotation; the loss is scaled by
-    ``loss_scale`` times the measured noise, which is not taken below ``floor_px``.
+    the measured noise, which is not taken below ``floor_px``.
     """
     focal = _transfer_focal(points)
     for _ in range(10):
@@ -90,7 +88,7 @@ def fit_rotation(
         inverse = 1.0 / np.maximum(turned[:, 2], 1e-6)
         image = turned[:, :2] * inverse[:, None]
         errors = focal * (image - points.rays_j[:, :2])
-        scale = loss_scale * robust_sigma(errors.ravel(), floor_px)
+        scale = robust_sigma(errors.ravel(), floor_px)
         d_turned = np.stack([turned @ g.T for g in GENERATORS], axis=1)
         # (M,3,2) flattened to one row per coordinate
         jacobian = (

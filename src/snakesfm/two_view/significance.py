@@ -5,16 +5,17 @@ import numpy as np
 from snakesfm.arrays import Array
 
 LOG10 = float(np.log(10.0))
+# smaller distances count as this, for keypoints are no points
+FLOOR_PX = 0.25
 
 
-def significance_of(errors_px: Array, width_px: float, height_px: float, floor_px: float = 0.25) -> float:
+def significance_of(errors_px: Array, width_px: float, height_px: float) -> float:
     """Minus log10 of the number of false alarms of a relative pose; larger is more significant.
 
     Parameters
     ----------
     errors_px : (M,) distances of all matches to their epipolar lines, inliers and outliers.
     width_px, height_px : extent of the area over which the matched keypoints lie.
-    floor_px : distances below this count as this, for keypoints are no points.
 
     The number of matches that agree is the one for which chance is least likely, so no threshold is needed.
     Source: Moisan and Stival, A probabilistic criterion to detect rigid point matches, IJCV 2004;
@@ -24,7 +25,7 @@ def significance_of(errors_px: Array, width_px: float, height_px: float, floor_p
     sample = 5
     if count <= sample:
         return 0.0
-    ordered = np.sort(np.maximum(np.abs(errors_px), floor_px))[sample:]
+    ordered = np.sort(np.maximum(np.abs(errors_px), FLOOR_PX))[sample:]
     agreeing = np.arange(sample + 1, count + 1)
     log_factorials = np.concatenate([[0.0], np.cumsum(np.log(np.arange(1, count + 1)))])
     log_samples = log_factorials[agreeing] - log_factorials[sample] - log_factorials[agreeing - sample]

@@ -42,17 +42,13 @@ class Cycles:
 
 
 def find_cycles(
-    node_count: int,
-    pairs: Array,
-    rotations: Array,
-    tried_per_edge: int = TRIED_PER_EDGE,
-    tried: int = TRIED,
+    node_count: int, pairs: Array, rotations: Array, tried_per_edge: int = TRIED_PER_EDGE
 ) -> Cycles:
     """Find the 3-cycles of a graph, or enough of them where it is dense.
 
     Every edge looks for cycles among the neighbours of its end of smaller degree: all of them up to
     ``tried_per_edge``, else as many, drawn evenly and depending on the edge alone. A graph with more
-    edges than fit ``tried`` candidates makes do with fewer per edge, so time is about linear in the edges.
+    edges than fit ``TRIED`` candidates makes do with fewer per edge, so time is about linear in the edges.
 
     Parameters
     ----------
@@ -64,7 +60,7 @@ def find_cycles(
     rotations = np.asarray(rotations, dtype=np.float64).reshape(-1, 3, 3)
     edge_count = len(pairs)
     sample = int(
-        np.clip(tried // max(edge_count, 1), min(FEWEST_TRIED_PER_EDGE, tried_per_edge), tried_per_edge)
+        np.clip(TRIED // max(edge_count, 1), min(FEWEST_TRIED_PER_EDGE, tried_per_edge), tried_per_edge)
     )
     keys = [np.zeros(0, dtype=np.int64)]
     for found in _candidates(node_count, pairs, sample):
