@@ -56,7 +56,7 @@ from snakesfm.errors import ConfigError
         ({"evaluate_model": {"relative_thresholds_deg": [0, 1]}}, ["_deg' = 0: ", "greater than 0."]),
         ({"evaluate_model": {"global_thresholds_deg": [1, 181]}}, ["_deg' = 181: ", "equal to 180."]),
         ({"adjust_bundle": {"max_iterations": 2**31}}, ["max_iterations' = 2147483648: ", "1000000"]),
-        ({"average_translations": {"edge_weight": float("inf")}}, ["edge_weight' = inf: ", "1000000"]),
+        ({"average_translations": {"ray_sigma_deg": float("inf")}}, ["ray_sigma_deg' = inf: ", "to 10."]),
         ({"average_rotations": {"min_component_images": 2}}, ["_images' = 2: ", "equal to 3."]),
         ({"export_model": {"georeference": "maybe"}}, ["= 'maybe': ", "be true or false (or 'auto')."]),
         ({"adjust_bundle": {"complete_tracks": "often"}}, ["= 'often': ", "be true or false."]),

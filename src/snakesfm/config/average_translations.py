@@ -29,9 +29,6 @@ class AverageTranslationsOptions(StageOptions):
     ray_sigma_deg: float = Field(default=0.3, gt=0, le=10)
     """Expected error of a ray in degrees, mostly from its camera's averaged rotation."""
 
-    edge_weight: float = Field(default=0.1, ge=0, le=1e6)
-    """Weight of a two-view direction relative to that of a ray in the refinement."""
-
     restarts: int = Field(default=4, ge=0, le=100)
     """Random starts of global positioning with more rays, tried only if few rays agree with the positions
     (repeated facades); the positions with which most rays agree are kept (0: none)."""

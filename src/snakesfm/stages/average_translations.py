@@ -122,7 +122,6 @@ def positioning_settings(options: "AverageTranslationsOptions", seed: int) -> Po
         ),
         refine=options.refine,
         rays_per_camera=options.rays_per_camera,
-        edge_weight=options.edge_weight,
         restarts=options.restarts,
         restart=GlobalPositioning(options.positioning_loss_scale, start=None),
         seed=seed,

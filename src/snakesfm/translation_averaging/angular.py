@@ -1,6 +1,7 @@
 """Bundle adjustment of centres and landmarks with known rotations, on the angles of the rays."""
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -21,6 +22,12 @@ RAYS_PER_LANDMARK = 64
 PAIRS_AT_ONCE = 1_000_000
 """Products of two rays of one landmark that are held at once."""
 
+# of an edge, that of a ray being one
+EDGE_WEIGHT = 0.1
+MOST_STEPS = 20
+# with ever larger damping, until one lowers the cost
+MOST_TRIALS = 6
+
 
 @dataclass(frozen=True)
 class _Linearized:
@@ -34,13 +41,37 @@ class _Linearized:
     edge_misses: Array
 
 
-def refine_angles(
-    problem: PositioningProblem,
-    centers: Array,
-    scale_rad: float,
-    edge_weight: float,
-    rounds: int = 20,
-) -> tuple[Array, Array]:
+@dataclass(frozen=True)
+class _Structure:
+    """Which 3x3 blocks the reduced camera system has; the same in every step."""
+
+    first: Array
+    second: Array
+    groups: Array
+    rows: Array
+    columns: Array
+
+
+@dataclass(frozen=True)
+class _Layout:
+    """Edges and rays by the rows of the cameras (n) and landmarks (m) that are unknown.
+
+    Parameters
+    ----------
+    problem : its rays are sorted by landmark and, within one, by image.
+    ends : (E,2) cameras of the edges.
+    cameras, landmarks : (Q,) of the rays.
+    structure : which blocks of the reduced camera system they fill.
+    """
+
+    problem: PositioningProblem
+    ends: Array
+    cameras: Array
+    landmarks: Array
+    structure: _Structure
+
+
+def refine_angles(problem: PositioningProblem, centers: Array, scale_rad: float) -> tuple[Array, Array]:
     """Centres (N,3) and landmarks (max track + 1, 3) that fit the rays and edges best, from a first guess.
 
     Levenberg-Marquardt with the landmarks eliminated (Schur complement); the residual of a ray is the chord
@@ -55,8 +86,6 @@ def refine_angles(
     centers : (N,3) first guess, NaN where there is none.
     scale_rad : scale of the Cauchy loss of a ray, and the least one of an edge, whose own is its standard
         deviation; both begin eight times as large.
-    edge_weight : weight of an edge relative to a ray.
-    rounds : most steps.
 
     Returns
     -------
@@ -73,32 +102,32 @@ def refine_angles(
     points = intersect(centers[problem.ray_images], problem.rays, problem.ray_tracks, track_count)
     problem = problem.select_rays(np.isfinite(points[problem.ray_tracks, 0]))
     images = problem.images()
-    column = np.full(problem.image_count, -1)
-    column[images] = np.arange(len(images))
-    problem, owners = _cut_landmarks(problem, RAYS_PER_LANDMARK)
-    track_row = problem.ray_tracks
-    ends = column[problem.pairs]
-    ray_column = column[problem.ray_images]
-    structure = _structure(ray_column, track_row, ends)
+    problem, owners = _cut_landmarks(problem)
+    place, spots = _descend(_layout(problem, images), centers[images], points[owners], scale_rad)
+    result = np.full_like(centers, np.nan)
+    result[images] = place
+    landmarks = np.full((track_count, 3), np.nan)
+    landmarks[owners[::-1]] = spots[::-1]
+    return result, landmarks
 
-    place, spots = centers[images].copy(), points[owners].copy()
-    sigmas = np.maximum(problem.sigmas_rad, scale_rad)
+
+def _descend(layout: _Layout, place: Array, spots: Array, scale_rad: float) -> tuple[Array, Array]:
+    """Centres (n,3) and landmarks (m,3) of least cost, from a first guess."""
+    sigmas = np.maximum(layout.problem.sigmas_rad, scale_rad)
     damping = 1e-4
-    state = _linearize(problem, ends, ray_column, track_row, place, spots)
+    state = _linearize(layout, place, spots)
     stage = 8.0
-    for _ in range(rounds):
+    for _ in range(MOST_STEPS):
         ray_scale = scale_rad * stage
         edge_scale = sigmas * stage
-        cost = _cost(state, ray_scale, edge_scale, edge_weight)
+        cost = _cost(state, ray_scale, edge_scale)
         ray_w = 1.0 / (ray_scale**2 + state.ray_misses**2)
-        edge_w = edge_weight / (edge_scale**2 + state.edge_misses**2)
+        edge_w = EDGE_WEIGHT / (edge_scale**2 + state.edge_misses**2)
         improved = False
-        for _ in range(6):
-            step, move = _step(
-                problem, state, ends, ray_column, track_row, structure, ray_w, edge_w, damping
-            )
-            trial = _linearize(problem, ends, ray_column, track_row, place + step, spots + move)
-            trial_cost = _cost(trial, ray_scale, edge_scale, edge_weight)
+        for _ in range(MOST_TRIALS):
+            step, move = _step(layout, state, ray_w, edge_w, damping)
+            trial = _linearize(layout, place + step, spots + move)
+            trial_cost = _cost(trial, ray_scale, edge_scale)
             if trial_cost < cost:
                 improved = True
                 break
@@ -110,20 +139,16 @@ def refine_angles(
             stage = max(stage / 2.0, 1.0)
         elif not improved or cost - trial_cost < 1e-4 * cost:
             break
-    result = np.full_like(centers, np.nan)
-    result[images] = place
-    landmarks = np.full((track_count, 3), np.nan)
-    landmarks[owners[::-1]] = spots[::-1]
-    return result, landmarks
+    return place, spots
 
 
-def _cut_landmarks(problem: PositioningProblem, most: int) -> tuple[PositioningProblem, Array]:
-    """The rays by landmarks, numbered from 0, of at most ``most`` rays, and the track (m) of each."""
+def _cut_landmarks(problem: PositioningProblem) -> tuple[PositioningProblem, Array]:
+    """The rays by landmarks, from 0 on, of at most ``RAYS_PER_LANDMARK``, and the track (m) of each."""
     problem, tracks = problem.number_tracks()
     row = problem.ray_tracks
     lengths = np.bincount(row, minlength=len(tracks))
     position = np.arange(len(row)) - (np.cumsum(lengths) - lengths)[row]
-    pieces = -(-lengths // most)
+    pieces = -(-lengths // RAYS_PER_LANDMARK)
     # Every n-th ray of a track: neighbouring images would see a landmark from one side.
     piece = (np.cumsum(pieces) - pieces)[row] + position % pieces[row]
     order = np.argsort(piece, kind="stable")
@@ -131,15 +156,9 @@ def _cut_landmarks(problem: PositioningProblem, most: int) -> tuple[PositioningP
     return replace(problem, ray_tracks=piece[order]), np.repeat(tracks, pieces)
 
 
-def _linearize(
-    problem: PositioningProblem,
-    ends: Array,
-    ray_column: Array,
-    track_row: Array,
-    place: Array,
-    spots: Array,
-) -> _Linearized:
-    offsets = spots[track_row] - place[ray_column]
+def _linearize(layout: _Layout, place: Array, spots: Array) -> _Linearized:
+    problem, ends = layout.problem, layout.ends
+    offsets = spots[layout.landmarks] - place[layout.cameras]
     ray_lengths = np.maximum(np.linalg.norm(offsets, axis=1), 1e-9)
     ray_units = offsets / ray_lengths[:, None]
     baselines = place[ends[:, 1]] - place[ends[:, 0]]
@@ -155,21 +174,19 @@ def _linearize(
     )
 
 
-def _cost(state: _Linearized, ray_scale: float, edge_scale: Array, edge_weight: float) -> float:
+def _cost(state: _Linearized, ray_scale: float, edge_scale: Array) -> float:
     rays = np.log1p((state.ray_misses / ray_scale) ** 2).sum()
     edges = np.log1p((state.edge_misses / edge_scale) ** 2).sum()
-    return float(rays + edge_weight * edges)
+    return float(rays + EDGE_WEIGHT * edges)
 
 
-@dataclass(frozen=True)
-class _Structure:
-    """Which 3x3 blocks the reduced camera system has; the same in every step."""
-
-    first: Array
-    second: Array
-    groups: Array
-    rows: Array
-    columns: Array
+def _layout(problem: PositioningProblem, images: Array) -> _Layout:
+    """The edges and rays of a problem whose cameras (n) are those of ``images``."""
+    column = np.full(problem.image_count, -1)
+    column[images] = np.arange(len(images))
+    ends, cameras = column[problem.pairs], column[problem.ray_images]
+    structure = _structure(cameras, problem.ray_tracks, ends)
+    return _Layout(problem, ends, cameras, problem.ray_tracks, structure)
 
 
 def _structure(ray_column: Array, track_row: Array, ends: Array) -> _Structure:
@@ -188,19 +205,10 @@ def _structure(ray_column: Array, track_row: Array, ends: Array) -> _Structure:
 
 
 def _step(
-    problem: PositioningProblem,
-    state: _Linearized,
-    ends: Array,
-    ray_column: Array,
-    track_row: Array,
-    structure: _Structure,
-    ray_w: Array,
-    edge_w: Array,
-    damping: float,
+    layout: _Layout, state: _Linearized, ray_w: Array, edge_w: Array, damping: float
 ) -> tuple[Array, Array]:
     """Damped Gauss-Newton steps of the cameras (n,3) and of the landmarks (m,3)."""
-    from scipy.sparse import coo_matrix
-
+    problem, ends, ray_column, track_row = layout.problem, layout.ends, layout.cameras, layout.landmarks
     cameras, landmarks = int(ends.max(initial=-1)) + 1, int(track_row.max(initial=-1)) + 1
     cameras = max(cameras, int(ray_column.max(initial=-1)) + 1)
     ray_h = perpendicular(state.ray_units) * (ray_w / state.ray_lengths**2)[:, None, None]
@@ -230,7 +238,17 @@ def _step(
 
     gain = ray_h @ inverse[track_row]
     reduced_g = camera_g + sum_by(np.einsum("qij,qj->qi", gain, point_g[track_row]), ray_column, cameras)
-    blocks = _blocks(structure, gain, ray_h, edge_h, camera_h)
+    matrix = _symmetric(layout.structure, _blocks(layout.structure, gain, ray_h, edge_h, camera_h), cameras)
+    delta = solve_spd(matrix, reduced_g.reshape(-1, 1), 3, FACTORED_UNKNOWNS, CG_TOLERANCE).reshape(-1, 3)
+    pull = sum_by(np.einsum("qij,qj->qi", ray_h, delta[ray_column]), track_row, landmarks)
+    move = np.einsum("pij,pj->pi", inverse, point_g + pull)
+    return delta, move
+
+
+def _symmetric(structure: _Structure, blocks: Array, cameras: int) -> Any:
+    """The sparse matrix (3n,3n) of which the upper blocks (B,3,3) are given."""
+    from scipy.sparse import coo_matrix
+
     off = structure.rows != structure.columns
     blocks = np.concatenate([blocks, blocks[off].transpose(0, 2, 1)])
     row = np.concatenate([structure.rows, structure.columns[off]])
@@ -238,11 +256,7 @@ def _step(
     shape = (len(blocks), 3, 3)
     rows = np.broadcast_to(3 * row[:, None, None] + np.arange(3)[:, None], shape)
     columns = np.broadcast_to(3 * column[:, None, None] + np.arange(3), shape)
-    matrix = coo_matrix((blocks.ravel(), (rows.ravel(), columns.ravel())), shape=(3 * cameras,) * 2).tocsc()
-    delta = solve_spd(matrix, reduced_g.reshape(-1, 1), 3, FACTORED_UNKNOWNS, CG_TOLERANCE).reshape(-1, 3)
-    pull = sum_by(np.einsum("qij,qj->qi", ray_h, delta[ray_column]), track_row, landmarks)
-    move = np.einsum("pij,pj->pi", inverse, point_g + pull)
-    return delta, move
+    return coo_matrix((blocks.ravel(), (rows.ravel(), columns.ravel())), shape=(3 * cameras,) * 2).tocsc()
 
 
 def _blocks(structure: _Structure, gain: Array, ray_h: Array, edge_h: Array, camera_h: Array) -> Array:

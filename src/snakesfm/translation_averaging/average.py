@@ -31,7 +31,6 @@ class PositioningSettings:
     limits : what holds a camera in place.
     refine : whether the first positions are refined by the angles of rays and edges.
     rays_per_camera : about how many take part.
-    edge_weight : of an edge relative to a ray in the refinement.
     restarts : random starts that are tried where few rays agree with the positions.
     restart : what starts, given more rays.
     seed : of what is drawn.
@@ -41,7 +40,6 @@ class PositioningSettings:
     limits: SupportLimits
     refine: bool
     rays_per_camera: int
-    edge_weight: float
     restarts: int
     restart: GlobalPositioning
     seed: int
@@ -176,7 +174,7 @@ def _landmarks(problem: PositioningProblem, centers: Array) -> Array:
 
 def _refined(problem: PositioningProblem, centers: Array, settings: PositioningSettings) -> Array:
     start = normalize_gauge(problem, centers)
-    return refine_angles(problem, start, settings.limits.sigma_rad, settings.edge_weight)[0]
+    return refine_angles(problem, start, settings.limits.sigma_rad)[0]
 
 
 def _checked(

@@ -161,7 +161,7 @@ def test_refinement_improves_a_disturbed_start_and_keeps_missing_cameras():
     problem = positioning(truth)
     start = truth.centers + np.random.default_rng(0).normal(0, 0.2, truth.centers.shape)
     start[4] = np.nan
-    refined, points = refine_angles(problem, start, np.radians(0.1), 0.1)
+    refined, points = refine_angles(problem, start, np.radians(0.1))
     assert np.isnan(refined[4]).all()
     keep = np.arange(20) != 4
     assert errors(refined, truth.centers).max() < 0.05
@@ -184,11 +184,11 @@ def test_landmarks_of_very_many_rays_are_cut_and_say_the_same(monkeypatch):
         cameras, pairs, directions, np.full(len(pairs), 0.01), images, tracks, rays
     )
     start = centers + rng.normal(0, 0.05, centers.shape)
-    cut, spots = refine_angles(problem, start, 1e-3, 0.1)
+    cut, spots = refine_angles(problem, start, 1e-3)
     monkeypatch.setattr("snakesfm.translation_averaging.angular.RAYS_PER_LANDMARK", cameras)
-    whole, _ = refine_angles(problem, start, 1e-3, 0.1)
+    whole, _ = refine_angles(problem, start, 1e-3)
     monkeypatch.setattr("snakesfm.translation_averaging.angular.PAIRS_AT_ONCE", 1000)
-    pieces, _ = refine_angles(problem, start, 1e-3, 0.1)
+    pieces, _ = refine_angles(problem, start, 1e-3)
     np.testing.assert_allclose(pieces, whole, atol=1e-9)
     assert not np.array_equal(cut, whole)
     assert errors(cut, centers).mean() < 1.3 * errors(whole, centers).mean()
