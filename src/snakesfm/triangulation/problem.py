@@ -1,7 +1,6 @@
-"""The interface of triangulators."""
+"""What is triangulated, and what points and observations must fulfil."""
 
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 
@@ -38,14 +37,6 @@ class TriangulationLimits:
     min_angle_deg: float
     max_hypotheses: int = 100
     seed: int = 0
-
-
-class Triangulator(Protocol):
-    """Robust triangulation: (T,3) points, NaN where there is none, and (L,) bool inlier observations."""
-
-    def __call__(self, problem: TriangulationProblem, limits: TriangulationLimits) -> tuple[Array, Array]:
-        """Triangulate all tracks."""
-        ...
 
 
 def check_points(
