@@ -56,7 +56,7 @@ def position_as_colmap(problem: PositioningProblem, seed: int) -> Array:
     """Pycolmap's global positioning with its default options: from random places, all longer tracks."""
     views = np.bincount(problem.ray_tracks)
     long = problem.select_rays(views[problem.ray_tracks] >= COLMAP_MIN_VIEWS)
-    return GlobalPositioning(COLMAP_LOSS_SCALE, start=None).position(long, seed)
+    return GlobalPositioning(COLMAP_LOSS_SCALE).position(long, seed)
 
 
 def first_positions(problem: PositioningProblem, options: AverageTranslationsOptions, seed: int) -> Array:

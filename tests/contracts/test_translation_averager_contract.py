@@ -107,10 +107,3 @@ class TestGlobalPositioning(TranslationAveragerContract):
     method = "global_positioning"
     exact_tolerance = 2e-2
     same_tolerance = 1e-6
-
-
-class TestGlobalPositioningFromChain(TranslationAveragerContract):
-    method = "global_positioning"
-    options: ClassVar = {"positioning_start": "chain"}
-    exact_tolerance = 2e-2
-    same_tolerance = 1e-6

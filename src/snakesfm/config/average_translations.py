@@ -49,9 +49,6 @@ class AverageTranslationsOptions(StageOptions):
     positioning_loss_scale: float = Field(default=0.01, gt=0)
     """Scale of the Huber loss of global_positioning."""
 
-    positioning_start: Literal["random", "chain"] = "random"
-    """Start of global_positioning: random positions, as in GLOMAP, or the result of scale_chain."""
-
     max_edge_residual_deg: float = Field(default=5.0, gt=0, le=180)
     """A two-view direction supports its cameras' positions if it differs from them by fewer degrees; in
     translation_recovery, 'residual' rejects the others."""

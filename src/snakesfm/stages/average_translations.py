@@ -123,7 +123,7 @@ def positioning_settings(options: "AverageTranslationsOptions", seed: int) -> Po
         refine=options.refine,
         rays_per_camera=options.rays_per_camera,
         restarts=options.restarts,
-        restart=GlobalPositioning(options.positioning_loss_scale, start=None),
+        restart=GlobalPositioning(options.positioning_loss_scale),
         seed=seed,
     )
 
@@ -147,8 +147,7 @@ def translation_averager(options: "AverageTranslationsOptions") -> TranslationAv
     if options.method == "translation_recovery":
         return replace(recovery, chain=chain)
     if options.method == "global_positioning":
-        start = chain if options.positioning_start == "chain" else None
-        return GlobalPositioning(options.positioning_loss_scale, start)
+        return GlobalPositioning(options.positioning_loss_scale)
     return chain
 
 

@@ -95,20 +95,15 @@ class TranslationRecovery:
 
 @dataclass(frozen=True)
 class GlobalPositioning:
-    """pycolmap's global positioning (Pan et al., "Global Structure-from-Motion Revisited", ECCV 2024).
-
-    It starts at the centres of ``start``, or at random ones if None, as in GLOMAP.
-    """
+    """pycolmap's global positioning (Pan et al., "Global Structure-from-Motion Revisited", ECCV 2024)."""
 
     loss_scale: float
-    start: ScaleChain | None
 
     def position(self, problem: PositioningProblem, seed: int) -> Array:
         """See :class:`TranslationAverager`."""
         from snakesfm.translation_averaging.positioning import position_globally
 
-        start = self.start.position(problem, seed) if self.start else None
-        return position_globally(problem, start, self.loss_scale, seed)
+        return position_globally(problem, self.loss_scale, seed)
 
 
 def with_rays(problem: PositioningProblem, rays_per_camera: int) -> PositioningProblem:

@@ -5,20 +5,17 @@ import numpy as np
 from snakesfm.arrays import Array
 from snakesfm.geometry.colmap_binding import pycolmap
 from snakesfm.grouping import sum_by
-from snakesfm.translation_averaging.landmarks import intersect
 from snakesfm.translation_averaging.problem import PositioningProblem
 
 FOCAL_PX = 1000.0
 
 
-def position_globally(
-    problem: PositioningProblem, start: Array | None, loss_scale: float, seed: int
-) -> Array:
+def position_globally(problem: PositioningProblem, loss_scale: float, seed: int) -> Array:
     """Centres (N,3) from rays alone; NaN for images without rays.
 
     The rays are handed over as pixels of virtual cameras that look along the mean ray of their image.
-    Ceres adds up in several threads, so results of two runs differ in the last bits (1e-11).
-    Without ``start`` (N,3) cameras and landmarks begin at random places.
+    Cameras and landmarks begin at random places. Ceres adds up in several threads, so results of two runs
+    differ: in their scale by thousandths, in their shape by about 1e-5.
     """
     pycolmap.logging.minloglevel = 2
     images, rows = np.unique(problem.ray_images, return_inverse=True)
@@ -29,11 +26,6 @@ def position_globally(
     local = local[usable]
     lengths = np.bincount(problem.ray_tracks, minlength=len(tracks))
     starts = np.cumsum(lengths) - lengths
-    points = np.zeros((len(tracks), 3))
-    if start is not None:
-        known = np.isfinite(start[problem.ray_images, 0])
-        seen = problem.select_rays(known)
-        points = np.nan_to_num(intersect(start[seen.ray_images], seen.rays, seen.ray_tracks, len(points)))
 
     model = pycolmap.Reconstruction()
     camera = pycolmap.Camera(
@@ -51,26 +43,22 @@ def position_globally(
         model.add_image_with_trivial_frame(
             pycolmap.Image(name=str(image), camera_id=1, image_id=image + 1, keypoints=pixels[mine])
         )
-        place = np.zeros(3) if start is None else np.nan_to_num(start[image])
-        pose = pycolmap.Rigid3d(pycolmap.Rotation3d(rotations[row]), -rotations[row] @ place)
+        pose = pycolmap.Rigid3d(pycolmap.Rotation3d(rotations[row]), np.zeros(3))
         frame = model.image(image + 1).frame
         frame.set_cam_from_world(1, pose)
         model.register_frame(frame.frame_id)
-    for point, first, length in zip(points, starts.tolist(), lengths.tolist(), strict=True):
+    for first, length in zip(starts.tolist(), lengths.tolist(), strict=True):
         elements = [
             pycolmap.TrackElement(int(problem.ray_images[q]) + 1, int(keypoint[q]))
             for q in range(first, first + length)
         ]
-        model.add_point3D(point, pycolmap.Track(elements))
+        model.add_point3D(np.zeros(3), pycolmap.Track(elements))
 
     options = pycolmap.GlobalPositionerOptions()
     options.use_gpu = False
     options.random_seed = seed
     options.loss_function_scale = loss_scale
     options.min_num_view_per_track = 2
-    if start is not None:
-        options.generate_random_positions = False
-        options.generate_random_points = False
     centers = np.full((problem.image_count, 3), np.nan)
     if pycolmap.run_global_positioning(options, pycolmap.PoseGraph(), model):
         for image in images.tolist():

@@ -180,15 +180,15 @@ def test_restarts_have_the_loss_of_global_positioning(monkeypatch):
     problem = positioning(make_problem(12, 600, "area", noise_px=0.3, seed=3))
     told = []
 
-    def position(rays, start, loss_scale, seed):
-        told.append((len(rays.rays), start, loss_scale, seed))
+    def position(rays, loss_scale, seed):
+        told.append((len(rays.rays), loss_scale, seed))
         return np.zeros((rays.image_count, 3))
 
     monkeypatch.setattr("snakesfm.translation_averaging.positioning.position_globally", position)
     misled = settings(refine=False, restarts=2, rays_per_camera=20, positioning_loss_scale=0.2)
     average_translations(problem, replace(misled, averager=Misled()))
     many = len(with_rays(problem, 300).rays)
-    assert told == [(many, None, 0.2, 0), (many, None, 0.2, 1)]
+    assert told == [(many, 0.2, 0), (many, 0.2, 1)]
 
 
 @pytest.mark.parametrize("method", ["scale_chain", "global_positioning"])

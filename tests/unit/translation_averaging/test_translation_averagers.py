@@ -27,20 +27,13 @@ def test_scale_chain_withstands_a_third_of_wrong_pairs(seed):
 
 def test_loss_scale_of_global_positioning_says_which_rays_count():
     truth = make_problem(8, 150, "area", noise_px=0.5, outlier_ratio=0.1, seed=3)
-    robust, plain = (
-        averager("global_positioning", positioning_loss_scale=scale, positioning_start="chain")
-        for scale in (1e-3, 10.0)
-    )
+    robust, plain = (averager("global_positioning", positioning_loss_scale=scale) for scale in (1e-3, 10.0))
     problem = thinned(positioning(truth))
     found = [errors(a.position(problem, 0), truth.centers) for a in (robust, plain)]
     assert 1e-4 < np.median(found[0]) < 0.1 * np.median(found[1])
 
 
-@pytest.mark.parametrize(
-    "options",
-    [{"method": "translation_recovery"}, {"method": "global_positioning", "positioning_start": "chain"}],
-)
-def test_the_chain_of_other_averagers_has_the_options_of_its_own(options, monkeypatch):
+def test_the_chain_of_translation_recovery_has_the_options_of_its_own(monkeypatch):
     problem = with_rays(positioning(make_problem(10, 600, "area", seed=3)), 20)
     told = []
 
@@ -50,8 +43,8 @@ def test_the_chain_of_other_averagers_has_the_options_of_its_own(options, monkey
 
     monkeypatch.setattr("snakesfm.translation_averaging.averagers.chain_centers", chain)
     few = {"recovery_rays_per_camera": 5, "ray_sigma_deg": 0.5, "max_relative_sigma": 0.2}
-    for method in ({"method": "scale_chain"}, options):
-        averager(**method, **few).position(problem, 0)
+    for method in ("scale_chain", "translation_recovery"):
+        averager(method, **few).position(problem, 0)
     assert told == [(len(problem.rays), 1.5 * np.radians(0.5), 0.2)] * 2
 
 
