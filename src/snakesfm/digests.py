@@ -31,6 +31,19 @@ def options_digest(stage_version: int, options: str) -> str:
     return hashlib.sha256(f"{stage_version}\0{options}".encode()).hexdigest()[:16]
 
 
+def result_digest(options: Any, beside: str, *contents: str) -> str:
+    """SHA-256 of all that the cached result of an image or a pair depends on.
+
+    Parameters
+    ----------
+    options : the stage's.
+    beside : what counts beside them, such as a digest of weights.
+    contents : digests of what was worked on.
+    """
+    text = "\0".join((*contents, options.canonical_json(), str(options.stage_version), beside))
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
 def settings_text(settings: Mapping[str, Any], seed: int) -> str:
     """Canonical JSON of a job's seed and settings, but for where things are: the same in any folder."""
     told = {name: value for name, value in settings.items() if name not in UNTOLD}

@@ -1,6 +1,5 @@
 """Find and describe keypoints in the images of one block."""
 
-import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,7 +17,7 @@ from snakesfm.artifacts.hloc import (
     read_hloc_size,
 )
 from snakesfm.artifacts.images import ImageIndex
-from snakesfm.digests import file_digest
+from snakesfm.digests import file_digest, result_digest
 from snakesfm.errors import ConfigError
 from snakesfm.features.extraction import DETECTORS, extract_keypoints, sample_colors
 from snakesfm.features.keypoints import Detector, KeypointSet, KeypointSource
@@ -63,7 +62,7 @@ def run(job: StageJob) -> None:
     rows = np.flatnonzero(index.blocks == int(job.settings["block"]))
     pictures = IndexedImages(index.names, index.sha256, job.settings["images"])
     finder = _create_finder(job, options)
-    beside = job.weights_digest() + str(job.settings.get("source_content", ""))
+    beside = job.sources_digest()
     names = [str(name) for name in index.names[rows]]
     # before they are read, so that a mask that changes meanwhile is noticed
     told = _told_of_masks(job)
@@ -72,7 +71,7 @@ def run(job: StageJob) -> None:
     # known keypoints are found by the image's name
     named = isinstance(finder, KeypointSource)
     digests = [
-        _digest(str(sha256), options, beside + contents.get(name, "") + (name if named else ""))
+        result_digest(options, beside + contents.get(name, "") + (name if named else ""), str(sha256))
         for sha256, name in zip(index.sha256[rows], names, strict=True)
     ]
     former = job.take_over(digests, _read_former)
@@ -213,11 +212,6 @@ class ImportedKeypoints:
             )
         self._told_of_scaling = True
         return points.scaled(x, y)
-
-
-def _digest(sha256: str, options: "ExtractFeaturesOptions", beside: str) -> str:
-    text = "\0".join((sha256, options.canonical_json(), str(options.stage_version), beside))
-    return hashlib.sha256(text.encode()).hexdigest()
 
 
 def _extract(

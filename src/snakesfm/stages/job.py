@@ -135,14 +135,15 @@ class StageJob:
 
         return choose_batch_size(self.batch_size)
 
-    def weights_digest(self) -> str:
-        """A digest of the weight files that the stage reads, for the digests of what it makes."""
+    def sources_digest(self) -> str:
+        """A digest of the weights and known results that it reads, for the digests of what it makes."""
+        known = str(self.settings.get("source_content", ""))
         models = self.settings.get("models", ())
         if not models:
-            return ""
+            return known
         from snakesfm.learned.weights import weights_digest
 
-        return weights_digest(models, Path(self.settings["weights"]))
+        return weights_digest(models, Path(self.settings["weights"])) + known
 
     def take_over(
         self, digests: Sequence[str], read: Callable[[Path, set[str]], Mapping[str, Any]]

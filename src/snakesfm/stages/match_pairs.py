@@ -1,7 +1,6 @@
 """Match the pairs of one tile: their keypoints, or without keypoints the images themselves."""
 
 import functools
-import hashlib
 import math
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
@@ -16,6 +15,7 @@ from snakesfm.artifacts.features import LocalFeatures
 from snakesfm.artifacts.hloc import open_hloc, read_hloc_matches
 from snakesfm.artifacts.images import ImageIndex
 from snakesfm.artifacts.pairs import ImagePairs, PairCoordinates, PairMatches
+from snakesfm.digests import result_digest
 from snakesfm.features.keypoints import KeypointSet
 from snakesfm.front_ends import DETECTOR_FREE
 from snakesfm.geometry.detector_sides import LEAST_SIDE_PX
@@ -58,13 +58,13 @@ def run(job: StageJob) -> None:
     free = options.method in DETECTOR_FREE
     kind: type[PairMatches | PairCoordinates] = PairCoordinates if free else PairMatches
     matcher: Any = _create_detector_free(job, options) if free else _create_matcher(job, options)
-    beside = job.weights_digest() + str(job.settings.get("source_content", ""))
+    beside = job.sources_digest()
     if options.method == "virtual_places":
         beside += f" {job.seed}"
     with ExitStack() as stack:
         source = ImageFiles(job) if free else FeatureFiles(job.paths("features"), stack)
         digests = [
-            _digest(source.digests[i], source.digests[j], options, beside) for i, j in pairs.tolist()
+            result_digest(options, beside, source.digests[i], source.digests[j]) for i, j in pairs.tolist()
         ]
         former = job.take_over(digests, functools.partial(_read_former, kind))
         results = {row: former[digest] for row, digest in enumerate(digests) if digest in former}
@@ -224,11 +224,6 @@ class ImageFiles:
         width, height = (max(1, int(side)) for side in seen)
         shown = (width * pixels.reduction, height * pixels.reduction)
         return Picture(name, shown, pixels.gray[:height, :width], pixels.rgb[:height, :width])
-
-
-def _digest(first: str, second: str, options: "MatchPairsOptions", beside: str) -> str:
-    text = "\0".join((first, second, options.canonical_json(), str(options.stage_version), beside))
-    return hashlib.sha256(text.encode()).hexdigest()
 
 
 def _read_former(
