@@ -46,14 +46,7 @@ def register_left_out(
     observed = _ObservedKeypoints.of(reconstruction)
     if not len(observed.keys):
         return []
-    registered = set(reconstruction.reg_image_ids())
-    matched: dict[int, list[int]] = {image: [] for image in left_out}
-    for pair in graph.image_pairs():
-        first, second = pycolmap.pair_id_to_image_pair(pair)
-        if first in matched and second in registered:
-            matched[first].append(second)
-        if second in matched and first in registered:
-            matched[second].append(first)
+    matched = _registered_partners(reconstruction, graph, left_out)
     found = {image: _matched_points(graph, image, others, observed) for image, others in matched.items()}
     in_use = {reconstruction.image(image_id).camera_id for image_id in reconstruction.reg_image_ids()}
     done = []
@@ -112,6 +105,21 @@ class _ObservedKeypoints:
         at = np.minimum(np.searchsorted(self.keys, keys), len(self.keys) - 1)
         there = (self.keys[at] == keys) & (rows < self.factor)
         return there, self.points[at[there]]
+
+
+def _registered_partners(
+    reconstruction: pycolmap.Reconstruction, graph: pycolmap.CorrespondenceGraph, images: list[int]
+) -> dict[int, list[int]]:
+    """The registered images that each of ``images`` has matches with."""
+    registered = set(reconstruction.reg_image_ids())
+    partners: dict[int, list[int]] = {image: [] for image in images}
+    for pair in graph.image_pairs():
+        first, second = pycolmap.pair_id_to_image_pair(pair)
+        if first in partners and second in registered:
+            partners[first].append(second)
+        if second in partners and first in registered:
+            partners[second].append(first)
+    return partners
 
 
 def _matched_points(

@@ -148,25 +148,6 @@ def _adjust(
         counts = {image_id - 1: image.num_points2D() for image_id, image in reconstruction.images.items()}
         return correspondence_graph(counts, *gather_inlier_matches(job.paths("geometries"), pairs))
 
-    fixed = job.settings.get("intrinsics", "fixed") == "fixed"
-    held = {row for row, camera in enumerate(poses.cameras) if fixed and camera.source == "given"}
-    held |= set(poses.camera_ids[taken].tolist())
-    solving = SolverSettings(
-        loss=options.loss,
-        constant_cameras=frozenset(row + 1 for row in held),
-        refine_focal=options.refine_focal,
-        refine_distortion=options.refine_distortion,
-        max_iterations=USUAL_ITERATIONS if options.max_iterations == "auto" else options.max_iterations,
-        function_tolerance=options.function_tolerance,
-    )
-    shared = options.model_dump(include=set(RoundSettings.__dataclass_fields__))
-    shared["min_track_length"] = min(options.min_track_length, max(2, int(poses.registered.sum())))
-    settings = RoundSettings(
-        **shared,
-        patient=options.max_iterations == "auto",
-        widen_lenses=job.settings.get("camera_model") == "auto" and options.refine_distortion,
-        seed=job.seed_for("bundle"),
-    )
     refines = options.refine_keypoints
     if refines == "auto":
         refines = most_share_a_camera(index.camera_ids)
@@ -177,9 +158,39 @@ def _adjust(
         reported.append(replace(record, name=prefix + record.name))
         _print_record(reported[-1])
 
+    solving, settings = _solver_settings(job, poses, taken), _round_settings(job, poses)
     adjust_rounds(reconstruction, read_graph, poses.cameras, solving, settings, report, sources)
     result, observed = from_reconstruction(reconstruction, poses)
     return result, observed.astype(np.float32), reported
+
+
+def _solver_settings(job: StageJob, poses: BundleModel, taken: np.ndarray) -> SolverSettings:
+    """How each pass is solved: given cameras are held if they are to be, and those of other models."""
+    options: AdjustBundleOptions = job.options
+    fixed = job.settings.get("intrinsics", "fixed") == "fixed"
+    held = {row for row, camera in enumerate(poses.cameras) if fixed and camera.source == "given"}
+    held |= set(poses.camera_ids[taken].tolist())
+    return SolverSettings(
+        loss=options.loss,
+        constant_cameras=frozenset(row + 1 for row in held),
+        refine_focal=options.refine_focal,
+        refine_distortion=options.refine_distortion,
+        max_iterations=USUAL_ITERATIONS if options.max_iterations == "auto" else options.max_iterations,
+        function_tolerance=options.function_tolerance,
+    )
+
+
+def _round_settings(job: StageJob, poses: BundleModel) -> RoundSettings:
+    """What is done in and between the rounds; a model of two images has no point in three."""
+    options: AdjustBundleOptions = job.options
+    shared = options.model_dump(include=set(RoundSettings.__dataclass_fields__))
+    shared["min_track_length"] = min(options.min_track_length, max(2, int(poses.registered.sum())))
+    return RoundSettings(
+        **shared,
+        patient=options.max_iterations == "auto",
+        widen_lenses=job.settings.get("camera_model") == "auto" and options.refine_distortion,
+        seed=job.seed_for("bundle"),
+    )
 
 
 def _start(
