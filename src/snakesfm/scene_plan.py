@@ -15,7 +15,7 @@ from snakesfm.blocks import choose_blocks, tile_names
 from snakesfm.config.base import StageOptions
 from snakesfm.config.configuration import SceneInputs, options_class
 from snakesfm.config.select_pairs import SelectPairsOptions
-from snakesfm.digests import file_digest, file_state, model_digest, options_digest, settings_text
+from snakesfm.digests import file_digest, file_state, model_digest, settings_text
 from snakesfm.front_ends import (
     DETECTOR_FREE,
     FRONT_ENDS,
@@ -30,7 +30,7 @@ from snakesfm.ingest.discover import MASK_DIGESTS_NAME, count_images, fingerprin
 from snakesfm.model_files import MODEL_FILES
 from snakesfm.pair_lists import estimate_pair_count, find_pair_list, pair_list_state
 from snakesfm.pipeline import STAGES
-from snakesfm.resources import UNDISTORTING_THREADS, Load, job_load
+from snakesfm.resources import Load, job_load
 
 SCENE_ARTIFACTS = (
     "index_images/index.h5",
@@ -240,9 +240,9 @@ class ScenePlan:
         return self.select_pairs.count_chosen(self.image_count, self.proposed_pair_count)
 
     @property
-    def undistorting_threads(self) -> int:
-        """The threads of export_model, which works on many images only where it undistorts them."""
-        return UNDISTORTING_THREADS if self.configuration.export_model.undistort else 1
+    def undistorts(self) -> bool:
+        """Whether export_model works on the images themselves."""
+        return bool(self.configuration.export_model.undistort)
 
     def load(self, stage: str, threads: int = 1) -> Load:
         """What one job of a stage works on with so many threads, on average over the blocks or tiles."""
@@ -253,8 +253,7 @@ class ScenePlan:
         pairs = self.proposed_pair_count if stage == "select_pairs" else self.pair_count
         side = self.configuration.extract_features.max_shorter_side_px
         load = job_load(stage, self.image_count, self.blocks, pairs, networks, batch, side)
-        undistorts = stage == "export_model" and self.configuration.export_model.undistort
-        return replace(load, undistorting=threads) if undistorts else load
+        return replace(load, undistorting=threads) if stage == "export_model" and self.undistorts else load
 
     def final_files(self) -> list[str]:
         """What a person looks at: the scene's model, its metrics and its report."""
@@ -358,11 +357,7 @@ class ScenePlan:
             }
         if stage == "calibrate_cameras":
             # what makes its provisional model
-            makers = {name: options_class(name) for name in PROVISIONAL_STAGES}
-            digests = {
-                name: options_digest(maker.stage_version, maker().canonical_json())
-                for name, maker in makers.items()
-            }
+            digests = {name: options_class(name)().digest() for name in PROVISIONAL_STAGES}
             distorts = self.configuration.adjust_bundle.refine_distortion
             return {"provisional": digests, "refine_distortion": distorts}
         if stage == "adjust_bundle":
@@ -401,8 +396,4 @@ class ScenePlan:
     @functools.cached_property
     def options_digests(self) -> dict[str, str]:
         """Digest of every stage's version and options."""
-        options = {stage: self.options(stage) for stage in STAGES}
-        return {
-            stage: options_digest(value.stage_version, value.canonical_json())
-            for stage, value in options.items()
-        }
+        return {stage: self.options(stage).digest() for stage in STAGES}

@@ -32,10 +32,9 @@ def plan_of(tmp_path: Path, **config: object) -> Plan:
 
 
 @pytest.mark.parametrize("undistort", [False, True])
-def test_only_undistorting_takes_more_threads_and_asks_for_them(tmp_path: Path, undistort: bool) -> None:
+def test_only_undistorting_asks_for_its_threads(tmp_path: Path, undistort: bool) -> None:
     images = str(make_images(tmp_path / "scene", 3))
     scene = plan_of(tmp_path, images=images, export_model={"undistort": undistort}).scenes["scene"]
-    assert scene.undistorting_threads == (4 if undistort else 1)
     assert scene.load("export_model", 3).undistorting == (3 if undistort else 0)
     assert scene.load("adjust_bundle", 3).undistorting == 0
 

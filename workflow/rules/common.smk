@@ -164,8 +164,9 @@ def job_command(stage):
 
 
 def undistorting_threads(wildcards):
-    """The threads of export_model."""
-    return PLAN.scenes[wildcards.scene].undistorting_threads
+    """The threads of export_model, which works on many images only where it undistorts them."""
+    scene = PLAN.scenes[wildcards.scene]
+    return resources.UNDISTORTING_THREADS if scene.undistorts else 1
 
 
 def memory_mb(stage):

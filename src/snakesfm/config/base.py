@@ -5,6 +5,8 @@ from typing import Any, ClassVar, Self, get_args
 
 from pydantic import BaseModel, ConfigDict, ValidationInfo, field_validator
 
+from snakesfm.digests import options_digest
+
 
 class Options(BaseModel):
     """Frozen and typed options; unknown keys are refused, and true and false where numbers are wanted."""
@@ -40,6 +42,10 @@ class StageOptions(Options):
     def canonical_json(self) -> str:
         """The options as JSON with sorted keys: equal options give equal text."""
         return json.dumps(self.model_dump(mode="json"), sort_keys=True)
+
+    def digest(self) -> str:
+        """A digest of these options and of the stage's version."""
+        return options_digest(self.stage_version, self.canonical_json())
 
     def resolved(self) -> Self:
         """The options as they are used, as far as these alone tell: 'auto' replaced, limits kept."""
