@@ -98,7 +98,7 @@ class TwoViewGeometries(Artifact):
     rejections: Array = column("(P)", "int8", _numbered(("accepted", *REJECTIONS[1:])))
     match_counts: Array = column("(P)", "int32", "matches between distinct places whose rays are finite")
     inlier_counts: Array = column("(P)", "int32", "inlier matches")
-    inlier_ratios: Array = column("(P)", "float64", "share of the matches that are inliers, see ratio_of")
+    inlier_ratios: Array = column("(P)", "float64", "share of the matches that are inliers")
     triangulation_angles_deg: Array = column("(P)", "float64", "median angle between the inliers' rays")
     offsets: Array = column("(P+1)", "int64", "rows offsets[k]:offsets[k+1] belong to pair k")
     inliers: Array = column("(M,2)", "int32", "inlier matches: keypoint row in image i and in image j")

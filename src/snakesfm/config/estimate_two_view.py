@@ -43,9 +43,6 @@ class EstimateTwoViewOptions(StageOptions):
     min_inlier_ratio: float = Field(default=0.1, ge=0, le=1)
     """Pairs with a smaller share of inliers among their matches are rejected."""
 
-    ratio_of: Literal["estimator", "refined"] = "refined"
-    """Whether the inlier ratio counts the robust estimator's inliers or those after refinement."""
-
     min_significance: float = Field(default=3.0, ge=0, le=1000)
     """Pairs are rejected if chance alone would produce their inliers with an expected count above
     10^-x; 0 turns this off."""

@@ -52,7 +52,7 @@ class TwoViewEstimate:
     rejection : empty if accepted, else why not: too_few_matches, estimation_failed, too_few_inliers,
         low_inlier_ratio, not_significant, indeterminate, ambiguous.
     match_count : matches between distinct places whose rays are finite.
-    inlier_ratio : share of inliers among them, see ``ratio_of``.
+    inlier_ratio : share of inliers among them.
     triangulation_angle_deg : median angle between the inliers' rays.
     significance : minus log10 of the number of false alarms, 0 where there is no pose.
     sigma_px : robust standard deviation of the inliers' Sampson errors, NaN where there is no pose.
@@ -101,8 +101,8 @@ def estimate_two_view_geometry(
         return _without_pose("estimation_failed", len(matches))
     if _is_hopeless(points, robust, options):
         return _without_pose("too_few_inliers", len(matches))
-    robust, refined, significance = _estimate(points, extent, robust, options, seed)
-    return _judge(points, matches, extent, robust, refined, significance, options, seed)
+    refined, significance = _estimate(points, extent, robust, options, seed)
+    return _judge(points, matches, extent, refined, significance, options, seed)
 
 
 def _without_pose(rejection: str, match_count: int) -> TwoViewEstimate:
@@ -133,14 +133,14 @@ def _is_hopeless(points: Correspondences, robust: RobustPose, options: "Estimate
 
 def _estimate(
     points: Correspondences, extent: Array, robust: RobustPose, options: "EstimateTwoViewOptions", seed: int
-) -> tuple[RobustPose, RefinedPose, float]:
+) -> tuple[RefinedPose, float]:
     """The best of a tight estimation and, where the matches are noisier, of one adapted to their noise."""
     best = _refined(points, extent, robust, options.max_error_px, options)
-    adapted = min(THRESHOLD_SIGMAS * best[1].sigma_px, options.max_adapted_error_px)
+    adapted = min(THRESHOLD_SIGMAS * best[0].sigma_px, options.max_adapted_error_px)
     if options.adapt_error and adapted > 1.5 * options.max_error_px:
         other = ESTIMATORS[options.estimator](points, adapted, options.max_iterations, seed)
         if other is not None:
-            best = max(best, _refined(points, extent, other, adapted, options), key=lambda found: found[2])
+            best = max(best, _refined(points, extent, other, adapted, options), key=lambda found: found[1])
     return best
 
 
@@ -150,7 +150,7 @@ def _refined(
     robust: RobustPose,
     max_error_px: float,
     options: "EstimateTwoViewOptions",
-) -> tuple[RobustPose, RefinedPose, float]:
+) -> tuple[RefinedPose, float]:
     """A robust pose, refined, and the significance of that."""
     refined = refine_pose(
         points,
@@ -160,14 +160,13 @@ def _refined(
         REACH_FACTOR * max_error_px,
         options.loss_scale,
     )
-    return robust, refined, significance_of(refined.errors_px, float(extent[0]), float(extent[1]))
+    return refined, significance_of(refined.errors_px, float(extent[0]), float(extent[1]))
 
 
 def _judge(
     points: Correspondences,
     matches: Array,
     extent: Array,
-    robust: RobustPose,
     refined: RefinedPose,
     significance: float,
     options: "EstimateTwoViewOptions",
@@ -178,8 +177,7 @@ def _judge(
     agrees &= _in_front(points, refined.rotation, refined.translation, refined.sigma_px)
     rows = unique_matches(matches, refined.errors_px, agrees)
     inliers = points.take(rows)
-    before = float(robust.inliers.sum()) / len(matches)
-    ratio = before if options.ratio_of == "estimator" else len(rows) / len(matches)
+    ratio = len(rows) / len(matches)
     angles = angle_between(inliers.rays_i @ refined.rotation.T, inliers.rays_j)
     angle_deg = float(np.degrees(np.median(angles))) if len(rows) else 0.0
 
