@@ -39,7 +39,7 @@ def snakesfm_rotations(problem: Problem, filtering: str, averaging: str) -> Arra
         np.maximum(problem.counts, 1e-6),
         problem.covariances[:, :3, :3],
     )
-    return average_view_graph(make_averager(averaging), graph, reasons, 5.0, 10.0, 2)[0]
+    return average_view_graph(make_averager(averaging), graph, reasons, 5.0, 10.0)[0]
 
 
 def colmap_rotations(problem: Problem, reweighting: str) -> Array:

@@ -184,7 +184,10 @@ def test_runs_share_features_and_matches_by_their_digests(small_scene: Path, wor
     damaged.unlink()
     damaged.write_bytes(b"damaged".ljust(size))
     second = shared.run(
-        *until, *config_of(small_scene, output="second"), "scene=other", "average_rotations={passes: 3}"
+        *until,
+        *config_of(small_scene, output="second"),
+        "scene=other",
+        "average_rotations={max_residual_deg: 9}",
     )
     assert second.status == 0, second.text
     with h5py.File(damaged) as repaired:

@@ -23,10 +23,6 @@ class AverageRotationsOptions(StageOptions):
     min_residual_deg: float = Field(default=5.0, ge=0, le=180)
     """Lower bound of that limit, in degrees."""
 
-    passes: int = Field(default=2, ge=1, le=5)
-    """Number of times the rotations are averaged; after each, edges are refused or accepted again by
-    their residuals."""
-
     min_component_images: int = Field(default=5, ge=3)
     """Smallest number of images (at least 3) for which a component besides the largest becomes a model
     of its own."""

@@ -19,7 +19,6 @@ def average_rotation_components(
     reasons: Array,
     smallest_limit_deg: float,
     largest_limit_deg: float,
-    passes: int,
     min_images: int,
 ) -> tuple[Array, Array, Array]:
     """Average the largest component of the kept edges, then of what that leaves the largest, and so on.
@@ -28,7 +27,7 @@ def average_rotation_components(
 
     Parameters
     ----------
-    graph, reasons, smallest_limit_deg, largest_limit_deg, passes : as of :func:`average_view_graph`.
+    graph, reasons, smallest_limit_deg, largest_limit_deg : as of :func:`average_view_graph`.
     min_images : images that a component must have; the first needs two.
 
     Returns
@@ -37,7 +36,6 @@ def average_rotation_components(
     reasons : (E,) str; ``rotation_residual`` and ``component`` where refused here.
     components : (N,) int32 of the images that have a rotation, 0 the first; -1 for others.
     """
-    limits = (smallest_limit_deg, largest_limit_deg, passes)
     rotations = np.full((graph.node_count, 3, 3), np.nan)
     components = np.full(graph.node_count, -1, dtype=np.int32)
     judged = np.where(reasons == "kept", "component", reasons).astype(object)
@@ -51,7 +49,9 @@ def average_rotation_components(
         numbers = np.cumsum(largest) - 1
         part = graph.subset(inside)
         part = replace(part, node_count=int(largest.sum()), pairs=numbers[part.pairs])
-        averaged, left, labels = average_view_graph(averager, part, reasons[inside], *limits)
+        averaged, left, labels = average_view_graph(
+            averager, part, reasons[inside], smallest_limit_deg, largest_limit_deg
+        )
         images = np.flatnonzero(largest)[labels == 0]
         if len(images) >= min_images or not tried.any():
             rotations[images] = averaged[labels == 0]
@@ -66,19 +66,17 @@ def average_view_graph(
     reasons: Array,
     smallest_limit_deg: float,
     largest_limit_deg: float,
-    passes: int,
 ) -> tuple[Array, Array, Array]:
     """Average the kept edges, then take back refused ones that agree, and refuse kept ones that do not.
 
     What the filter refused has its say in between: the averaged rotations descend on the robust cost of all
-    edges, so that a filter's wrong choices do no harm.
+    edges, so that a filter's wrong choices do no harm. Then the edges that are kept are averaged once more.
 
     Parameters
     ----------
     graph : all N images and E edges, of which the kept ones connect all.
     reasons : (E,) str, ``kept`` or what refused an edge.
     smallest_limit_deg, largest_limit_deg : bounds of the residual above which an edge is refused.
-    passes : how often is averaged, at most, and edges judged after it.
 
     Returns
     -------
@@ -95,7 +93,7 @@ def average_view_graph(
     components = label_components(graph.node_count, graph.pairs[kept])
     rotations = average(kept)
     judging = rotations if kept.all() else _improve_on_all(graph, rotations)
-    for remaining in range(passes - 1, -1, -1):
+    for last in (False, True):
         residuals = np.degrees(edge_residuals(graph.pairs, graph.rotations, judging))
         fits = residuals <= residual_limit(residuals[kept], smallest_limit_deg, largest_limit_deg)
         if not fits.any():
@@ -105,7 +103,7 @@ def average_view_graph(
         reasons = np.where(fits, "kept", np.where(kept, "rotation_residual", reasons)).astype(object)
         reasons, components = keep_largest_component(graph.node_count, graph.pairs, reasons)
         kept = reasons == "kept"
-        if np.array_equal(kept, before) or remaining == 0:
+        if np.array_equal(kept, before) or last:
             break
         rotations = judging = average(kept)
     rotations[components != 0] = np.nan

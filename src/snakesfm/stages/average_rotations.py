@@ -49,7 +49,6 @@ def run(job: StageJob) -> None:
         reasons,
         options.min_residual_deg,
         options.max_residual_deg,
-        options.passes,
         options.min_component_images,
     )
     residuals = np.degrees(edge_residuals(graph.pairs, graph.rotations, rotations))

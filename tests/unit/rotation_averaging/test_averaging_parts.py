@@ -204,7 +204,7 @@ def test_refused_edges_that_agree_are_taken_back_and_wrong_ones_refused():
     )
     filtered[pairs[:, 1] - pairs[:, 0] == 1] = "kept"
     graph = RotationGraph(40, pairs, rotations, np.ones(len(pairs)), np.full((len(pairs), 3, 3), np.nan))
-    averaged, reasons, components = average_view_graph(TwoStageAverager(), graph, filtered, 5.0, 10.0, 2)
+    averaged, reasons, components = average_view_graph(TwoStageAverager(), graph, filtered, 5.0, 10.0)
     assert (components == 0).all()
     assert (reasons[~wrong] == "kept").all()
     assert np.mean(reasons[wrong] == "kept") < 0.05
