@@ -1,6 +1,6 @@
 """Options of average_translations."""
 
-from typing import ClassVar, Literal, Self
+from typing import ClassVar, Literal
 
 from pydantic import Field
 
@@ -61,8 +61,3 @@ class AverageTranslationsOptions(StageOptions):
 
     max_relative_sigma: float = Field(default=0.1, gt=0)
     """Largest standard deviation of a camera centre, relative to the median distance to its landmarks."""
-
-    def resolved(self) -> Self:
-        """The options with no more rays for translation_recovery than there are for all methods."""
-        fewer = min(self.recovery_rays_per_camera, self.rays_per_camera)
-        return self.model_copy(update={"recovery_rays_per_camera": fewer})

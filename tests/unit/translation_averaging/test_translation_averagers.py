@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from positioned_cameras import CHAIN, averager, errors, positioning, thinned
 
-from snakesfm.config.average_translations import AverageTranslationsOptions
 from snakesfm.synthetic.problems import make_problem, perturb_rotations
 from snakesfm.translation_averaging.averagers import share_at_one_scale, with_rays
 from snakesfm.translation_averaging.recovery import mfas_weights
@@ -49,12 +48,11 @@ def test_the_chain_of_translation_recovery_has_the_options_of_its_own(monkeypatc
 
 
 def test_recovery_has_no_more_rays_than_take_part():
-    for rays, recovery, used in ((100, 12, 12), (10, 12, 10), (100, 300, 100)):
-        options = AverageTranslationsOptions(rays_per_camera=rays, recovery_rays_per_camera=recovery)
-        assert options.resolved().recovery_rays_per_camera == used
-        assert options.resolved().rays_per_camera == rays
-    usual = AverageTranslationsOptions()
-    assert usual.resolved() == usual
+    problem = positioning(make_problem(30, 1500, "area", seed=3))
+    chosen = with_rays(problem, 20)
+    assert len(with_rays(chosen, 10).rays) < len(chosen.rays) < len(problem.rays)
+    for again in (20, 300):
+        np.testing.assert_array_equal(with_rays(chosen, again).rays, chosen.rays)
 
 
 def test_what_the_chain_falls_back_to_has_the_options_of_recovery():
