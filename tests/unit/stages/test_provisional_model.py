@@ -8,8 +8,9 @@ from synthetic_scene import HEADER, write_scene
 
 from snakesfm.artifacts import CalibratedCameras, PairMatches
 from snakesfm.config.calibrate_cameras import CalibrateCamerasOptions
-from snakesfm.pipeline import STAGES, calibrate_cameras
+from snakesfm.pipeline import STAGES
 from snakesfm.scene_plan import PROVISIONAL_STAGES
+from snakesfm.stages import calibrate_cameras
 from snakesfm.stages.job import StageJob
 from snakesfm.stages.provisional_model import STEPS
 from snakesfm.synthetic.problems import make_problem
