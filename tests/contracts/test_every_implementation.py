@@ -20,6 +20,7 @@ from contracts.test_relative_pose_estimators import RelativePoseContract
 from contracts.test_rotation_averager_contract import AveragerContract
 from contracts.test_surveys import SurveyContract
 from contracts.test_translation_averager_contract import TranslationAveragerContract
+from contracts.test_triangulator_methods import TriangulatorContract
 from contracts.test_view_graph_filters import ViewGraphFilterContract
 
 from snakesfm.config.adjust_bundle import AdjustBundleOptions
@@ -30,6 +31,7 @@ from snakesfm.config.estimate_two_view import EstimateTwoViewOptions
 from snakesfm.config.extract_features import ExtractFeaturesOptions
 from snakesfm.config.filter_view_graph import FilterViewGraphOptions
 from snakesfm.config.match_pairs import MatchPairsOptions
+from snakesfm.config.triangulate_tracks import TriangulateTracksOptions
 from snakesfm.features import virtual_points
 from snakesfm.features.extraction import DETECTORS
 from snakesfm.front_ends import DETECTOR_FREE, FRONT_ENDS
@@ -87,6 +89,7 @@ CONTRACTS = {
         "method",
         options(AverageTranslationsOptions, "method"),
     ),
+    "Triangulator": (TriangulatorContract, "method", options(TriangulateTracksOptions, "method")),
     "BundleAdjuster": (BundleAdjusterContract, "solver", options(AdjustBundleOptions, "solver")),
     "Survey": (SurveyContract, "name", set(SURVEYS)),
 }

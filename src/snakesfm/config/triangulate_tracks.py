@@ -1,6 +1,6 @@
 """Options of triangulate_tracks."""
 
-from typing import ClassVar
+from typing import ClassVar, Literal
 
 from pydantic import Field
 
@@ -11,6 +11,10 @@ class TriangulateTracksOptions(StageOptions):
     """How tracks are triangulated."""
 
     stage_version: ClassVar[int] = 2
+
+    method: Literal["ransac_dlt", "pycolmap"] = "ransac_dlt"
+    """RANSAC over pairs of observations with a linear solution from the inliers, or pycolmap's
+    LO-RANSAC."""
 
     max_hypotheses: int = Field(default=100, ge=1, le=10_000)
     """Largest number of observation pairs tried per track."""

@@ -12,7 +12,7 @@ from snakesfm.geometry.detector_pixels import detector_scales, reduce_cameras
 from snakesfm.geometry.poses import translation_of
 from snakesfm.grouping import offsets_of
 from snakesfm.stages.job import StageJob
-from snakesfm.triangulation.problem import TriangulationLimits
+from snakesfm.triangulation.interface import TriangulationLimits
 from snakesfm.triangulation.tracks import mean_colors, triangulate_tracks
 
 if TYPE_CHECKING:
@@ -47,6 +47,7 @@ def run(job: StageJob) -> None:
             options.max_hypotheses,
             job.seed_for("triangulation"),
         ),
+        options.method,
         options.min_length,
     )
     count = len(tracks.offsets) - 1

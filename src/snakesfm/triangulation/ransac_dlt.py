@@ -4,7 +4,7 @@ import numpy as np
 
 from snakesfm.arrays import Array
 from snakesfm.grouping import offsets_of
-from snakesfm.triangulation.problem import TriangulationLimits, TriangulationProblem, check_points
+from snakesfm.triangulation.interface import TriangulationLimits, TriangulationProblem, check_points
 
 BATCH_VALUES = 4_000_000
 REFINEMENTS = 4
@@ -13,9 +13,8 @@ REFINEMENTS = 4
 def triangulate_ransac_dlt(
     problem: TriangulationProblem, limits: TriangulationLimits
 ) -> tuple[Array, Array]:
-    """Robust triangulation: (T,3) points, NaN where there is none, and (L,) bool inlier observations.
+    """Midpoints of pairs of rays, scored on all observations; then DLT and Gauss-Newton over the inliers.
 
-    Midpoints of pairs of rays, scored on all observations; then DLT and Gauss-Newton over the inliers.
     The scheme of GTSfM, with a truncated squared error (MSAC) as score. All pairs are tried where there are
     no more than ``max_hypotheses``, else a seeded choice that depends on the length of the track alone.
 

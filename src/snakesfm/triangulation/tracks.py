@@ -1,6 +1,7 @@
-"""Triangulation of all tracks of a scene."""
+"""Triangulation of all tracks of a scene, with a triangulator by name."""
 
 from collections.abc import Sequence
+from typing import Literal
 
 import numpy as np
 
@@ -8,8 +9,20 @@ from snakesfm.arrays import Array
 from snakesfm.geometry.camera import Camera, undistort
 from snakesfm.geometry.poses import has_pose
 from snakesfm.grouping import offsets_of
-from snakesfm.triangulation.problem import TriangulationLimits, TriangulationProblem
-from snakesfm.triangulation.ransac_dlt import triangulate_ransac_dlt
+from snakesfm.triangulation.interface import TriangulationLimits, TriangulationProblem, Triangulator
+
+Method = Literal["ransac_dlt", "pycolmap"]
+
+
+def triangulator(method: Method) -> Triangulator:
+    """The triangulator of a name."""
+    if method == "pycolmap":
+        from snakesfm.triangulation.lo_ransac import triangulate_pycolmap
+
+        return triangulate_pycolmap
+    from snakesfm.triangulation.ransac_dlt import triangulate_ransac_dlt
+
+    return triangulate_ransac_dlt
 
 
 def triangulate_tracks(
@@ -21,6 +34,7 @@ def triangulate_tracks(
     image_ids: Array,
     keypoints: Array,
     limits: TriangulationLimits,
+    method: Method = "ransac_dlt",
     min_length: int = 2,
 ) -> tuple[Array, Array]:
     """Points of tracks, robust to wrong observations.
@@ -34,6 +48,7 @@ def triangulate_tracks(
     image_ids : (L,) int.
     keypoints : (L,2) pixels.
     limits : largest reprojection error in pixels, smallest angle in degrees, hypotheses and seed.
+    method : ``ransac_dlt`` or ``pycolmap``.
     min_length : observations that a point must keep.
 
     Returns
@@ -48,7 +63,7 @@ def triangulate_tracks(
     problem = TriangulationProblem(
         rotations, translations, focals, offsets_of(lengths), image_ids[usable], rays[usable]
     )
-    points, inliers = triangulate_ransac_dlt(problem, limits)
+    points, inliers = triangulator(method)(problem, limits)
     kept = np.zeros(len(image_ids), dtype=bool)
     kept[usable] = inliers
     short = np.bincount(track_of[kept], minlength=len(points)) < min_length

@@ -7,7 +7,7 @@ import pytest
 
 from snakesfm.geometry.camera import Camera
 from snakesfm.synthetic.problems import make_problem
-from snakesfm.triangulation.problem import TriangulationLimits, max_angles
+from snakesfm.triangulation.interface import TriangulationLimits, max_angles
 from snakesfm.triangulation.ransac_dlt import hypotheses_of
 from snakesfm.triangulation.tracks import mean_colors, triangulate_tracks
 

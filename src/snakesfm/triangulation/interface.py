@@ -1,6 +1,7 @@
-"""What is triangulated, and what points and observations must fulfil."""
+"""The interface of triangulators."""
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
@@ -37,6 +38,14 @@ class TriangulationLimits:
     min_angle_deg: float
     max_hypotheses: int = 100
     seed: int = 0
+
+
+class Triangulator(Protocol):
+    """Robust triangulation: (T,3) points, NaN where there is none, and (L,) bool inlier observations."""
+
+    def __call__(self, problem: TriangulationProblem, limits: TriangulationLimits) -> tuple[Array, Array]:
+        """Triangulate all tracks."""
+        ...
 
 
 def check_points(
