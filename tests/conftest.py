@@ -6,6 +6,7 @@ from pathlib import Path
 from types import ModuleType
 
 import hypothesis
+import one_thread  # noqa: F401  before anything loads numpy
 import pytest
 from workflow_runner import Outcome, Workflow
 

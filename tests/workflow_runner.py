@@ -7,9 +7,12 @@ import shutil
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
+
+from snakemake_forks import call_snakemake
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -41,29 +44,32 @@ class Workflow:
     environment: Mapping[str, str] | None = None
 
     def command(self, *arguments: str, cores: int = 2) -> list[str]:
-        base = [sys.executable, "-m", "snakemake", "--snakefile", str(ROOT / "Snakefile")]
-        profile = ["--profile", str(ROOT / "profiles" / self.profile)]
+        return [sys.executable, "-m", "snakemake", *self._arguments(*arguments, cores=cores)]
+
+    def _arguments(self, *arguments: str, cores: int) -> list[str]:
+        common = [
+            "--snakefile",
+            str(ROOT / "Snakefile"),
+            "--profile",
+            str(ROOT / "profiles" / self.profile),
+        ]
         if self.profile == "local":
-            profile += ["--cores", str(cores)]
-        return [*base, *profile, *arguments]
+            common += ["--cores", str(cores)]
+        return [*common, *arguments]
 
     def run(self, *arguments: str, cores: int = 2, timeout: float = 300) -> Outcome:
-        done = subprocess.run(
-            self.command(*arguments, cores=cores),
-            cwd=self.folder,
-            env=self.environment,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            text=True,
-            timeout=timeout,
-            check=False,
-        )
-        return Outcome(done.returncode, done.stdout)
+        """Run to the end, without the time that the command takes to load Snakemake."""
+        environment = os.environ if self.environment is None else self.environment
+        with tempfile.NamedTemporaryFile() as log:
+            status = call_snakemake(
+                self._arguments(*arguments, cores=cores), self.folder, environment, Path(log.name), timeout
+            )
+            return Outcome(status, Path(log.name).read_text("utf-8"))
 
-    def start(self, *arguments: str) -> "subprocess.Popen[str]":
+    def start(self, *arguments: str, cores: int = 2) -> "subprocess.Popen[str]":
         """Start a run whose output can be read when it has ended."""
         return subprocess.Popen(
-            self.command(*arguments),
+            self.command(*arguments, cores=cores),
             cwd=self.folder,
             env=self.environment,
             stdout=subprocess.PIPE,

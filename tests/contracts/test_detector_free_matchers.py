@@ -10,8 +10,6 @@ from snakesfm.evaluation.colmap_model import read_model
 from snakesfm.features.virtual import VirtualKeypoints
 from snakesfm.matching.detector_free import DETECTOR_FREE_MATCHERS, Picture
 from snakesfm.matching.loftr import shrink
-from snakesfm.synthetic.render_demo import make_demo
-from snakesfm.synthetic.scene import DemoOptions
 
 
 def picture(gray, name, reduction=1):
@@ -142,12 +140,9 @@ class TestVirtualPlaces(DetectorFreeContract):
     method = "virtual_places"
     spread_px, noise_px = 2.0, 0.3
 
-    @pytest.fixture(scope="class")
-    @classmethod
-    def model(cls, tmp_path_factory):
-        folder = tmp_path_factory.mktemp("virtual") / "square"
-        make_demo(folder, DemoOptions(image_count=16, width=100, height=75))
-        return read_model(folder / "reference")
+    @pytest.fixture
+    def model(self, small_scene):
+        return read_model(small_scene / "reference")
 
     @pytest.fixture
     def matcher(self, model):
@@ -158,7 +153,7 @@ class TestVirtualPlaces(DetectorFreeContract):
     @pytest.fixture
     def pictures(self, model):
         names = sorted(image.name for image in model.images.values())
-        return [picture(np.full((75, 100), 9, np.uint8), name) for name in names[:3]]
+        return [picture(np.full((300, 400), 9, np.uint8), name) for name in names[:3]]
 
     def test_places_are_near_the_points_that_both_images_see(self, matcher, pictures, model):
         known = VirtualKeypoints(model)

@@ -27,6 +27,8 @@ def test_a_front_end_reconstructs_photographs(
         f"reference={folder / 'reference'}",
         f"cameras={folder / 'reference'}",
         "output=out",
+        # each job with a network loads torch
+        "blocks=1",
         f"front_end={front_end}",
         f"weights={weights}",
         "extract_features={max_shorter_side_px: 240, max_keypoints: 512}",

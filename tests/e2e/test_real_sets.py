@@ -1,6 +1,7 @@
 """Real photographs with ground truth, from images to evaluated model, as a user runs it."""
 
 import json
+import os
 from pathlib import Path
 
 import cv2
@@ -10,6 +11,7 @@ from workflow_runner import Workflow
 
 from benchmarks.compare.sets import read_sets
 from benchmarks.thinned import thin
+from snakesfm.cache import VARIABLE
 
 pytestmark = pytest.mark.e2e
 
@@ -21,6 +23,17 @@ KNOWN = [
     ("imc_reichstag_10", (43.2, 78.5, 87.1)),
 ]
 UNKNOWN = [("sceaux_castle_11", (85.0, 94.5, 96.5)), ("strecha_fountain_p11", (85.0, 95.0, 97.0))]
+
+
+@pytest.fixture(scope="module")
+def shared(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Features and matches that runs on the same photographs share: to the bit those that each would make."""
+    return tmp_path_factory.mktemp("shared")
+
+
+@pytest.fixture
+def workflow(tmp_path: Path, shared: Path) -> Workflow:
+    return Workflow(tmp_path, environment={**os.environ, VARIABLE: str(shared)})
 
 
 def metrics_of(workflow: Workflow, folder: Path, *config: str) -> dict:

@@ -10,7 +10,7 @@ import h5py
 import numpy as np
 import pytest
 from random_weights import megaloc_state, write_netvlad
-from workflow_runner import ROOT, Workflow, copy_run
+from workflow_runner import ROOT, Workflow, config_of, copy_run
 
 from snakesfm.artifacts import (
     GlobalDescriptors,
@@ -164,9 +164,12 @@ def write_random_superpoint(folder: Path, matcher: str) -> None:
             torch.save(made._network.state_dict(), path)
 
 
-@pytest.mark.parametrize(("method", "batch_size"), [("superglue", 5), ("lightglue", "auto")])
+# each job with a network loads torch
+@pytest.mark.parametrize(
+    ("method", "batch_size", "blocks"), [("superglue", 5, 1), ("lightglue", "auto", 2)]
+)
 def test_superpoint_and_its_matchers_run_until_nothing_fits_with_random_weights(
-    small_scene: Path, workflow: Workflow, method: str, batch_size: int | str
+    small_scene: Path, workflow: Workflow, method: str, batch_size: int | str, blocks: int
 ) -> None:
     write_random_superpoint(workflow.folder / "weights", method)
     outcome = workflow.run(
@@ -175,7 +178,8 @@ def test_superpoint_and_its_matchers_run_until_nothing_fits_with_random_weights(
         "output=out",
         f"front_end=superpoint+{method}",
         f"batch_size={batch_size}",
-        "extract_features={max_keypoints: 64}",
+        f"blocks={blocks}",
+        "extract_features={max_keypoints: 64, max_shorter_side_px: 150}",
         "select_pairs={method: sequential, look_ahead: 1}",
         "match_pairs={min_score: 0.0}",
     )
@@ -187,7 +191,7 @@ def test_superpoint_and_its_matchers_run_until_nothing_fits_with_random_weights(
     assert said and all(sentence in line for line in said)
     out = workflow.folder / "out" / "square"
     features = [LocalFeatures.read(path) for path in sorted((out / "extract_features").glob("*.h5"))]
-    assert sum(len(block.image_ids) for block in features) == 16
+    assert len(features) == blocks and sum(len(block.image_ids) for block in features) == 16
     for block in features:
         assert block.descriptors.dtype == np.float16 and block.descriptors.shape[1] == 256
         assert (np.diff(block.offsets) == 64).all()
@@ -246,7 +250,8 @@ def test_places_found_pair_by_pair_are_merged(
     assert outcome.status == 0, outcome.text
     assert set(outcome.rules) == {"merge_keypoints", "index_matches"}
     (out / "match_pairs" / "0-1.h5").unlink()
-    run(workflow, small_scene, *config)
+    again = workflow.run("--until", "match_pairs", *config_of(small_scene, *config))
+    assert again.status == 0, again.text
     assert "64 pairs (64 taken over)" in (out / "logs" / "match_pairs" / "0-1.log").read_text()
 
 
@@ -266,6 +271,7 @@ def test_loftr_runs_through_with_random_weights(small_scene: Path, workflow: Wor
         f"images={small_scene / 'images'}",
         "output=out",
         "front_end=loftr",
+        "blocks=1",
         "select_pairs={method: sequential, look_ahead: 1}",
         "match_pairs={min_score: 0.0, longer_side_px: 128}",
     )
@@ -298,7 +304,7 @@ def test_images_are_described_by_networks_with_random_weights(
         "select_pairs={method: retrieval, top_k: 2, preview_keypoints: 0}",
         f"describe_images={{method: {method}}}",
     ]
-    config += [f"images={small_scene / 'images'}", "output=out"]
+    config += [f"images={small_scene / 'images'}", "output=out", "blocks=1"]
     outcome = workflow.run("--until", "select_pairs", "--config", *config)
     assert outcome.status == 0, outcome.text
     # no keypoints and no vocabulary are needed to choose pairs

@@ -1,6 +1,7 @@
 """The table of front-ends says what was measured, and what was not."""
 
 import json
+import shutil
 from pathlib import Path
 
 import pytest
@@ -8,8 +9,6 @@ import pytest
 from benchmarks.compare.sets import ImageSet
 from benchmarks.front_ends import COMPARED, DEGREES, ORACLE, USUAL, options_of, render
 from benchmarks.on_sets import Run, SetTable
-from snakesfm.synthetic.render_demo import make_demo
-from snakesfm.synthetic.scene import DemoOptions
 
 
 def value(area: float) -> dict:
@@ -34,9 +33,9 @@ def test_rows_means_failures_and_gaps() -> None:
     assert text.count("| virtual |") == 2 and "not run" in render({}, ["a"], ["sift"])
 
 
-def test_the_oracle_spreads_points_where_a_reference_has_none(tmp_path: Path) -> None:
+def test_the_oracle_spreads_points_where_a_reference_has_none(small_scene: Path, tmp_path: Path) -> None:
     assert ORACLE in USUAL and set(USUAL) <= set(COMPARED) and "imported" not in COMPARED
-    make_demo(tmp_path / "a", DemoOptions(image_count=8, width=64, height=48))
+    shutil.copytree(small_scene, tmp_path / "a")
     image_set = ImageSet(tmp_path / "a", False, False)
     assert options_of(ORACLE, image_set) == ["front_end=virtual"]
     (tmp_path / "a" / "reference" / "points3D.txt").write_text("")
@@ -46,9 +45,11 @@ def test_the_oracle_spreads_points_where_a_reference_has_none(tmp_path: Path) ->
     assert options_of("sift", image_set) == ["front_end=sift"]
 
 
-def test_what_is_there_is_not_measured_again(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+def test_what_is_there_is_not_measured_again(
+    small_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
     for name in ("one", "two"):
-        make_demo(tmp_path / name, DemoOptions(image_count=8, width=64, height=48))
+        shutil.copytree(small_scene, tmp_path / name)
     measured, broken = [], [True]
 
     def count(image_set: ImageSet, method: str, run: Run) -> dict:
