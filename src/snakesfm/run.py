@@ -24,6 +24,9 @@ LOCK_NAME = ".snakesfm.lock"
 CONFIGURATION_NAME = ".snakesfm.config.json"
 MOST_SENTENCES = 10
 KILLED = "was killed from outside (out of memory, time limit, cancelled, or its node failed)"
+# what libjpeg says before it ends the process that COLMAP undistorts images in
+JPEG_LACKS_SPACE = "out of disk space?"
+LACKS_SPACE = "ended as the disk is full: free the disk, then run again"
 FEWER_JOBS = "; if memory ran out, with fewer jobs at once: --cores N or --resources mem_mb=MB"
 RELATIVE_AUC = re.compile(r"relative_pose_auc_(.+)deg")
 
@@ -278,7 +281,9 @@ class Run:
             if lines and lines[-1].startswith("error: "):
                 sentences.append(f"{lines[-1].removeprefix('error: ')} (log: {log})")
             elif not self.interrupted and (not lines or not find_cost(lines[-1])):
-                sentences.append(f"{log.parent.name} {log.stem} {KILLED} (log: {log})")
+                full = any(JPEG_LACKS_SPACE in line for line in lines[-MOST_SENTENCES:])
+                reason = LACKS_SPACE if full else KILLED
+                sentences.append(f"{log.parent.name} {log.stem} {reason} (log: {log})")
         return sentences
 
     def _summary(self, scene: ScenePlan) -> dict[str, Any]:
