@@ -175,7 +175,12 @@ def test_scenes_replace_images_and_both_are_refused() -> None:
             list_scenes(load_configuration({"scenes": scenes, key: value}))
 
 
-@pytest.mark.parametrize("name", ["../up", ".hidden", "a/b"])
+def test_a_scene_name_may_contain_what_snakemake_does_not_replace() -> None:
+    for name in ("a<b", "a > b", "<1>", "<B>"):
+        assert list(list_scenes(load_configuration({"images": "x", "scene": name}))) == [name]
+
+
+@pytest.mark.parametrize("name", ["../up", ".hidden", "a/b", "a{b", "a<b>", "<results>"])
 def test_a_scene_name_that_is_no_folder_name_is_refused(name: str) -> None:
     with pytest.raises(ConfigError, match="scene=NAME"):
         list_scenes(load_configuration({"images": "x", "scene": name}))

@@ -200,7 +200,7 @@ def test_a_rule_is_named_with_its_twins_or_not_at_all(words: str, is_refused: bo
     check_named_together(said, "select_pairs", set())
 
 
-@pytest.mark.parametrize("output", ["{braces}", "a{b"])
+@pytest.mark.parametrize("output", ["{braces}", "a{b", "a<log>"])
 def test_an_output_folder_with_braces_is_refused(tmp_path: Path, output: str) -> None:
     make_images(tmp_path / "scene", 2)
     with pytest.raises(ConfigError, match="braces"):

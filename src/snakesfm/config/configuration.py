@@ -42,6 +42,8 @@ KINDS = {
     "string_type": "text",
 }
 
+# what Snakemake replaces in a path
+REPLACED = r"[{}]|<[a-z][a-z0-9_]*>"
 # what common file systems allow
 MOST_NAME_BYTES = 255
 # of braces the codes: it is a wildcard's constraint as well, in which Snakemake takes no braces
@@ -297,15 +299,16 @@ def list_scenes(configuration: RunOptions) -> dict[str, SceneInputs]:
         scenes = {configuration.scene or scene_name(configuration.images): SceneInputs(**inputs)}
     else:
         _refuse_beside_scenes(configuration)
-    if re.search("[{}]", configuration.output):
+    if re.search(REPLACED, configuration.output):
         raise ConfigError(
-            f"The output folder '{configuration.output}' contains braces: choose another with output=DIR."
+            f"The output folder '{configuration.output}' contains braces or a word in <>, which Snakemake "
+            "would replace: choose another with output=DIR."
         )
     for name in scenes:
-        if not re.fullmatch(SCENE_PATTERN, name):
+        if not re.fullmatch(SCENE_PATTERN, name) or re.search(REPLACED, name):
             raise ConfigError(
-                f"'{name}' cannot be the name of a scene: set scene=NAME to a name without '/' or braces "
-                "that does not start with a dot."
+                f"'{name}' cannot be the name of a scene: set scene=NAME to a name without '/', braces or "
+                "words in <> that does not start with a dot."
             )
         if len(os.fsencode(name)) > MOST_NAME_BYTES:
             raise ConfigError(
