@@ -78,6 +78,19 @@ class Run:
                 if unknown:
                     _set_aside(scene, unknown)
 
+    def keep_others_away(self) -> None:
+        """Have no other run write to the output folder as long as this process lives.
+
+        For what Snakemake does without jobs, so without :meth:`start`.
+
+        Raises
+        ------
+        ConfigError : another run is writing to the folder.
+        """
+        with contextlib.suppress(OSError):
+            self.lock = (self.plan.output / LOCK_NAME).open(encoding="utf-8")
+            self._lock(self.lock, fcntl.LOCK_SH)
+
     @contextlib.contextmanager
     def _beside_no_other(self) -> Iterator[None]:
         """Refuse to work beside another run, also without own jobs, and have none start meanwhile."""
