@@ -6,7 +6,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from snakesfm.config.configuration import list_scenes, load_configuration
+from snakesfm.cache import VARIABLE
+from snakesfm.config.configuration import TEXT_KEYS, RunOptions, list_scenes, load_configuration
 from snakesfm.errors import ConfigError
 from snakesfm.pipeline import STAGES
 from snakesfm.scene_checks import check_scene
@@ -26,6 +27,21 @@ def _check_writable(folder: Path) -> None:
         )
 
 
+def _check_homes(configuration: RunOptions) -> None:
+    """Refuse paths that begin with '~' where the system knows no such home folder."""
+    keys = [key for key in TEXT_KEYS if key != "scene"]
+    given = [(key, getattr(configuration, key)) for key in keys]
+    given += [(key, getattr(scene, key, "")) for scene in configuration.scenes.values() for key in keys]
+    for key, path in [*given, (VARIABLE, os.environ.get(VARIABLE, ""))]:
+        try:
+            Path(path).expanduser()
+        except RuntimeError:
+            raise ConfigError(
+                f"The home folder '{path.split('/')[0]}' of {key}={path} is not known: write the "
+                "whole path."
+            ) from None
+
+
 class Plan:
     """All scenes of a run.
 
@@ -37,6 +53,7 @@ class Plan:
 
     def __init__(self, config: Mapping[str, Any], weights_only: bool = False) -> None:
         self.configuration = configuration = load_configuration(config)
+        _check_homes(configuration)
         self.output = Path(configuration.output).expanduser()
         self.weights = Path(configuration.weights).expanduser()
         self.weights_only = weights_only

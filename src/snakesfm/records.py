@@ -17,6 +17,7 @@ MAKES_NOTHING = re.compile(
     r"--(dry-?run|touch|unlock|lint|report|archive|l[tipu]|list.*|summary|detailed-summary|dag|rulegraph|filegraph|"
     r"d3dag|cleanup-.*|delete-.*|containerize|generate-unit-tests|export-cwl|print-compilation)(=.*)?"
 )
+DELETES = re.compile(r"--delete-.*")
 # it does not make all of its targets, or keeps no records
 MAKES_PART = frozenset(("--until", "-U", "--omit-from", "-O", "--drop-metadata"))
 # an option that names rules, the first of them in the same word
@@ -137,6 +138,11 @@ def split_words(arguments: Iterable[str]) -> set[str]:
 def makes_nothing(arguments: Iterable[str]) -> bool:
     """Whether Snakemake is only asked for something, by these arguments of its command line."""
     return any(MAKES_NOTHING.fullmatch(argument) for argument in arguments)
+
+
+def deletes(arguments: Iterable[str]) -> bool:
+    """Whether Snakemake is asked to delete results, by these arguments of its command line."""
+    return any(DELETES.fullmatch(argument) for argument in arguments)
 
 
 def _record_name(output: str) -> str:

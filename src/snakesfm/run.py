@@ -24,6 +24,9 @@ LOCK_NAME = ".snakesfm.lock"
 CONFIGURATION_NAME = ".snakesfm.config.json"
 MOST_SENTENCES = 10
 KILLED = "was killed from outside (out of memory, time limit, cancelled, or its node failed)"
+# what libjpeg and SQLite say before they end a process in which COLMAP writes images or a database
+FULL_SIGNS = ("out of disk space?", "database or disk is full")
+LACKS_SPACE = "ended as the disk is full: free the disk, then run again"
 FEWER_JOBS = "; if memory ran out, with fewer jobs at once: --cores N or --resources mem_mb=MB"
 RELATIVE_AUC = re.compile(r"relative_pose_auc_(.+)deg")
 
@@ -74,6 +77,19 @@ class Run:
                 unknown = unrecorded_files(scene.artifacts())
                 if unknown:
                     _set_aside(scene, unknown)
+
+    def keep_others_away(self) -> None:
+        """Have no other run write to the output folder as long as this process lives.
+
+        For what Snakemake does without jobs, so without :meth:`start`.
+
+        Raises
+        ------
+        ConfigError : another run is writing to the folder.
+        """
+        with contextlib.suppress(OSError):
+            self.lock = (self.plan.output / LOCK_NAME).open(encoding="utf-8")
+            self._lock(self.lock, fcntl.LOCK_SH)
 
     @contextlib.contextmanager
     def _beside_no_other(self) -> Iterator[None]:
@@ -278,7 +294,9 @@ class Run:
             if lines and lines[-1].startswith("error: "):
                 sentences.append(f"{lines[-1].removeprefix('error: ')} (log: {log})")
             elif not self.interrupted and (not lines or not find_cost(lines[-1])):
-                sentences.append(f"{log.parent.name} {log.stem} {KILLED} (log: {log})")
+                full = any(sign in line for line in lines for sign in FULL_SIGNS)
+                reason = LACKS_SPACE if full else KILLED
+                sentences.append(f"{log.parent.name} {log.stem} {reason} (log: {log})")
         return sentences
 
     def _summary(self, scene: ScenePlan) -> dict[str, Any]:

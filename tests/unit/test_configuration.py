@@ -65,6 +65,17 @@ from snakesfm.errors import ConfigError
             {"extract_features": None, "max_keypoints": 3},
             ["key 'extract_features' has no value", "indented below it, such as 'max_keypoints'"],
         ),
+        (
+            {"extract_features": {"max_keypoints:500": None}},
+            [
+                "'extract_features.max_keypoints:500' contains a colon: write 'max_keypoints: 500', with a space"
+            ],
+        ),
+        ({"extract_features": "upright:true"}, ["key 'extract_features' = 'upright:true': ", "each colon"]),
+        ({"blocks": 201}, ["'blocks' = 201: ", "less than or equal to 200 (or 'auto')."]),
+        ({"calibrate_cameras": {"min_focal_ratio": 1e-300}}, ["min_focal_ratio' = 1e-300: ", "0.01."]),
+        ({"calibrate_cameras": {"default_sigma": 1e-300}}, ["default_sigma' = 1e-300: ", "0.0001."]),
+        ({"adjust_bundle": {"loss_scale_px": 1e-300}}, ["loss_scale_px' = 1e-300: ", "0.001 (or 'auto')."]),
         ({"extract_features": "sift"}, ["key 'extract_features' = 'sift': ", "a block of options"]),
         ({"scenes": {"a": {"image": "x"}}}, ["key 'scenes.a.image': did you mean 'images'?"]),
         ({"scenes": {"a": {"cameras": "x"}}}, ["key 'scenes.a.images' is missing"]),
@@ -164,10 +175,22 @@ def test_scenes_replace_images_and_both_are_refused() -> None:
             list_scenes(load_configuration({"scenes": scenes, key: value}))
 
 
-@pytest.mark.parametrize("name", ["../up", ".hidden", "a/b"])
+def test_a_scene_name_may_contain_what_snakemake_does_not_replace() -> None:
+    for name in ("a<b", "a > b", "<1>", "<B>"):
+        assert list(list_scenes(load_configuration({"images": "x", "scene": name}))) == [name]
+
+
+@pytest.mark.parametrize("name", ["../up", ".hidden", "a/b", "a{b", "a<b>", "<results>"])
 def test_a_scene_name_that_is_no_folder_name_is_refused(name: str) -> None:
     with pytest.raises(ConfigError, match="scene=NAME"):
         list_scenes(load_configuration({"images": "x", "scene": name}))
+
+
+def test_a_scene_name_that_is_too_long_for_a_folder_is_refused() -> None:
+    # a letter of two bytes
+    assert list(list_scenes(load_configuration({"images": "x", "scene": 127 * "ä"}))) == [127 * "ä"]
+    with pytest.raises(ConfigError, match=r"255 bytes.*scene=NAME"):
+        list_scenes(load_configuration({"images": "x", "scene": 128 * "ä"}))
 
 
 @pytest.mark.parametrize("stage", STAGES)

@@ -39,6 +39,23 @@ def test_only_undistorting_asks_for_its_threads(tmp_path: Path, undistort: bool)
     assert scene.load("adjust_bundle", 3).undistorting == 0
 
 
+@pytest.mark.parametrize("key", ["images", "output", "reference", "weights", "SNAKESFM_CACHE"])
+def test_a_home_folder_that_is_not_known_gives_one_sentence(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, key: str
+) -> None:
+    config = {"images": str(make_images(tmp_path / "scene", 3))}
+    if key == "SNAKESFM_CACHE":
+        monkeypatch.setenv(key, "~nobody-of-this-name/x")
+    else:
+        config[key] = "~nobody-of-this-name/x"
+    with pytest.raises(ConfigError, match=f"'~nobody-of-this-name' of {key}=.* write the whole path"):
+        plan_of(tmp_path, **config)
+    scenes = {"one": {"images": str(tmp_path / "scene"), "cameras": "~nobody-of-this-name/K.txt"}}
+    monkeypatch.delenv("SNAKESFM_CACHE", raising=False)
+    with pytest.raises(ConfigError, match=r"of cameras=~nobody-of-this-name/K\.txt is not known"):
+        plan_of(tmp_path, scenes=scenes)
+
+
 @given(st.integers(1, 40))
 def test_tiles_cover_every_pair_of_blocks_once(blocks: int) -> None:
     tiles = [tuple(map(int, name.split("-"))) for name in tile_names(blocks)]
@@ -183,7 +200,7 @@ def test_a_rule_is_named_with_its_twins_or_not_at_all(words: str, is_refused: bo
     check_named_together(said, "select_pairs", set())
 
 
-@pytest.mark.parametrize("output", ["{braces}", "a{b"])
+@pytest.mark.parametrize("output", ["{braces}", "a{b", "a<log>"])
 def test_an_output_folder_with_braces_is_refused(tmp_path: Path, output: str) -> None:
     make_images(tmp_path / "scene", 2)
     with pytest.raises(ConfigError, match="braces"):

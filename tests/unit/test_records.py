@@ -13,6 +13,7 @@ from snakesfm.errors import ConfigError
 from snakesfm.records import (
     check_backend,
     check_folder,
+    deletes,
     forget,
     makes_nothing,
     unrecorded_files,
@@ -114,6 +115,14 @@ def test_a_forgotten_file_stays_and_is_older_than_all_and_unrecorded(tmp_path: P
 )
 def test_what_makes_nothing_is_told_by_its_arguments(arguments: list[str], nothing: bool) -> None:
     assert makes_nothing(arguments) == nothing
+
+
+@pytest.mark.parametrize(
+    ("arguments", "some"),
+    [(["--delete-all-output", "-n"], True), (["--delete-temp-output"], True), (["--touch", "all"], False)],
+)
+def test_what_deletes_is_told_by_its_arguments(arguments: list[str], some: bool) -> None:
+    assert deletes(arguments) == some
 
 
 def test_params_of_a_file_are_held_against_its_record(tmp_path: Path) -> None:

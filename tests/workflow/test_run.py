@@ -294,10 +294,17 @@ def test_two_runs_at_once_on_one_output_are_refused(finished, small_scene: Path,
         lock.flush()
         fcntl.flock(lock, fcntl.LOCK_EX)
         outcome = workflow.run(*config_of(small_scene))
-    assert outcome.status != 0
-    assert "Another run (process 1 on elsewhere)" in outcome.text
-    assert "Traceback" not in outcome.text
-    assert outcome.rules == []
+        deleted = workflow.run("--delete-all-output", *config_of(small_scene))
+    for refused in (outcome, deleted):
+        assert refused.status != 0
+        assert "Another run (process 1 on elsewhere)" in refused.text
+        assert "Traceback" not in refused.text
+        assert refused.rules == []
+    model = workflow.folder / "out" / "square" / "export_model" / "sparse" / "0" / "points3D.bin"
+    assert model.is_file()
+    alone = workflow.run("--delete-all-output", *config_of(small_scene))
+    assert alone.status == 0, alone.text
+    assert not model.exists()
 
 
 def test_logs_say_what_the_jobs_cost(finished) -> None:

@@ -17,7 +17,13 @@ from snakesfm.job_server import JobServer
 from snakesfm.local_gpu import limit_gpu_jobs
 from snakesfm.model_files import MODEL_FILES
 from snakesfm.plan import Plan
-from snakesfm.records import check_backend, check_folder, makes_nothing, split_words
+from snakesfm.records import (
+    check_backend,
+    check_folder,
+    deletes,
+    makes_nothing,
+    split_words,
+)
 from snakesfm.rule_settings import check_named_together, share_resources
 from snakesfm.run import Run
 from snakesfm.scene_checks import check_results
@@ -50,6 +56,8 @@ try:
     RUN = Run(PLAN)
     if workflow.is_main_process and not makes_nothing(sys.argv[1:]):
         RUN.refuse_unrecorded(asked)
+    if workflow.is_main_process and deletes(sys.argv[1:]):
+        RUN.keep_others_away()
 except SnakesfmError as error:
     raise refusal(error) from None
 

@@ -25,11 +25,11 @@ class AdjustBundleOptions(StageOptions):
     loss: Literal["huber", "cauchy", "squared"] = "cauchy"
     """Robust loss on the reprojection errors in all passes but the last."""
 
-    loss_scale_px: Literal["auto"] | Annotated[float, Field(gt=0.0, le=100.0)] = "auto"
+    loss_scale_px: Literal["auto"] | Annotated[float, Field(ge=1e-3, le=100.0)] = "auto"
     """Reprojection error above which the loss of the last round grows more slowly; 'auto' measures the
     keypoint noise and uses loss_scale_sigmas times its standard deviation."""
 
-    loss_scale_sigmas: float = Field(default=3.5, gt=0.0, le=100.0)
+    loss_scale_sigmas: float = Field(default=3.5, ge=1e-3, le=100.0)
     """Loss scale that loss_scale_px 'auto' uses, in standard deviations of the keypoint noise; 2.4 is
     better without keypoint refinement."""
 

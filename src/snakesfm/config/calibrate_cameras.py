@@ -30,7 +30,7 @@ class CalibrateCamerasOptions(StageOptions):
     planar_ratio: float = Field(default=0.8, gt=0, le=1)
     """Pairs do not vote if a single homography explains this share of their inliers."""
 
-    min_focal_ratio: float = Field(default=0.4, gt=0, le=10)
+    min_focal_ratio: float = Field(default=0.4, ge=0.01, le=10)
     """Smallest plausible focal length, relative to the longer image side."""
 
     max_focal_ratio: float = Field(default=6.0, gt=0, le=100)
@@ -42,10 +42,10 @@ class CalibrateCamerasOptions(StageOptions):
     max_sigma: float = Field(default=0.15, gt=0, le=10)
     """Estimates with a larger relative standard deviation are discarded, and the prior is kept."""
 
-    exif_sigma: float = Field(default=0.03, gt=0, le=10)
+    exif_sigma: float = Field(default=0.03, ge=1e-4, le=10)
     """Relative standard deviation of a focal length from EXIF, as a prior."""
 
-    default_sigma: float = Field(default=0.5, gt=0, le=10)
+    default_sigma: float = Field(default=0.5, ge=1e-4, le=10)
     """Relative standard deviation of the default focal length, as a prior."""
 
     provisional_model: Literal["auto"] | bool = "auto"

@@ -42,6 +42,10 @@ KINDS = {
     "string_type": "text",
 }
 
+# what Snakemake replaces in a path
+REPLACED = r"[{}]|<[a-z][a-z0-9_]*>"
+# what common file systems allow
+MOST_NAME_BYTES = 255
 # of braces the codes: it is a wildcard's constraint as well, in which Snakemake takes no braces
 SCENE_PATTERN = r"[^/.\x7b\x7d][^/\x7b\x7d]*"
 
@@ -113,7 +117,7 @@ class RunOptions(SceneInputs):
     """Several scenes: a mapping from name to images, cameras, masks and the other inputs of a scene."""
     seed: int = Field(default=0, ge=0)
     """Seed of the random draws; the same seed gives the same model (a large one but for rounding)."""
-    blocks: Annotated[int, Field(ge=1)] | Literal["auto"] = "auto"
+    blocks: Annotated[int, Field(ge=1, le=200)] | Literal["auto"] = "auto"
     """Number of blocks the images are split into; B blocks give B(B+1)/2 tiles of pairs, one job each.
     'auto' depends on the number of images."""
 
@@ -195,6 +199,9 @@ def _one_sentence(cls: type[BaseModel], error: ValidationError) -> str:
         path = _path_of(first)
     key = ".".join(path)
     if first["type"] == "extra_forbidden":
+        written, _, value = path[-1].partition(":")
+        if value:
+            return f"Configuration key '{key}' contains a colon: write '{written}: {value}', with a space."
         known = _keys_beside(cls, path)
         elsewhere = [
             f"{stage}.{path[-1]}" for stage in STAGES if path[-1] in options_class(stage).model_fields
@@ -248,6 +255,8 @@ def _refused_block(key: str, value: Any, others: Sequence[str]) -> str:
     stray = [name for name in others if key != "scenes" and name in known]
     what = "one block of keys per scene" if key == "scenes" else "a block of options"
     remedy = f", such as '{stray[0]}', which stands beside it" if stray else " or in braces"
+    if isinstance(value, str) and value.partition(":")[0] in known:
+        remedy += ", with a space after each colon"
     return f"Configuration key '{key}' {given}: it should hold {what}, indented below it{remedy}."
 
 
@@ -290,14 +299,20 @@ def list_scenes(configuration: RunOptions) -> dict[str, SceneInputs]:
         scenes = {configuration.scene or scene_name(configuration.images): SceneInputs(**inputs)}
     else:
         _refuse_beside_scenes(configuration)
-    if re.search("[{}]", configuration.output):
+    if re.search(REPLACED, configuration.output):
         raise ConfigError(
-            f"The output folder '{configuration.output}' contains braces: choose another with output=DIR."
+            f"The output folder '{configuration.output}' contains braces or a word in <>, which Snakemake "
+            "would replace: choose another with output=DIR."
         )
     for name in scenes:
-        if not re.fullmatch(SCENE_PATTERN, name):
+        if not re.fullmatch(SCENE_PATTERN, name) or re.search(REPLACED, name):
             raise ConfigError(
-                f"'{name}' cannot be the name of a scene: set scene=NAME to a name without '/' or braces "
-                "that does not start with a dot."
+                f"'{name}' cannot be the name of a scene: set scene=NAME to a name without '/', braces or "
+                "words in <> that does not start with a dot."
+            )
+        if len(os.fsencode(name)) > MOST_NAME_BYTES:
+            raise ConfigError(
+                f"The name of scene '{name[:40]}...' is longer than a folder's may be ({MOST_NAME_BYTES} "
+                "bytes): choose a shorter one with scene=NAME."
             )
     return scenes

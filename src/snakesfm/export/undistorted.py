@@ -1,5 +1,6 @@
 """Images without distortion, and the model and the masks that belong to them."""
 
+import os
 import shutil
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
@@ -12,11 +13,14 @@ from snakesfm.arrays import Array
 from snakesfm.errors import ImageError
 from snakesfm.geometry.camera import Camera
 from snakesfm.geometry.colmap_binding import pycolmap
+from snakesfm.geometry.colmap_checks import check_binary, lack_of_space
 from snakesfm.ingest.masks import find_mask, read_mask
 
 JPEG_SUFFIXES = (".jpg", ".jpeg")
 # COLMAP takes less for none, and it moves no pixel by a thousandth
 LEAST_DISTORTION = 1e-7
+PINHOLE_PARAMETERS = 4
+JPEG_END = b"\xff\xd9"
 GRID = 50
 
 
@@ -37,6 +41,7 @@ def write_undistorted(target: Path, sparse: Path, images: Path, masks: Path | No
     ------
     ImageError : an image can no longer be read, or has another size than its camera.
     ConfigError : a mask cannot be used.
+    OSError : the disk is full.
     """
     model = pycolmap.Reconstruction(str(sparse))
     registered = [model.images[image_id] for image_id in model.reg_image_ids()]
@@ -47,6 +52,7 @@ def write_undistorted(target: Path, sparse: Path, images: Path, masks: Path | No
     distorted = target / "distorted"
     distorted.mkdir(parents=True)
     model.write_binary(str(distorted))
+    check_binary(distorted, model)
     jpegs = [image.name for image in registered if image.name.lower().endswith(JPEG_SUFFIXES)]
     # of no names COLMAP takes all
     names = jpegs or [image.name for image in registered[:1]]
@@ -57,10 +63,11 @@ def write_undistorted(target: Path, sparse: Path, images: Path, masks: Path | No
         if masks is not None:
             list(pool.map(partial(_write_mask, target / "masks", masks, model), registered))
     flat = target / "sparse"
-    model = target / "model"
-    flat.rename(model)
+    check_binary(flat, model, PINHOLE_PARAMETERS)
+    inner = target / "model"
+    flat.rename(inner)
     flat.mkdir()
-    model.rename(flat / "0")
+    inner.rename(flat / "0")
     shutil.rmtree(target / "stereo")
     for script in target.glob("run-colmap-*.sh"):
         script.unlink()
@@ -120,6 +127,7 @@ def _write_other(
     """
     file = target / image.name
     if image.name.lower().endswith(JPEG_SUFFIXES) and file.is_file():
+        _check_end(file, images / image.name)
         return
     # most jobs need no more than JPEG
     from PIL import Image
@@ -131,6 +139,18 @@ def _write_other(
     pixels = _undistort(read_image(images / image.name).rgb, camera, options)
     file.parent.mkdir(parents=True, exist_ok=True)
     Image.fromarray(pixels).save(file, lossless=True, quality=95)
+
+
+def _check_end(jpeg: Path, source: Path) -> None:
+    """Refuse a JPEG whose end COLMAP had no room for."""
+    size = jpeg.stat().st_size
+    # what needs no warp is copied, and cameras may append to a JPEG what they like
+    if size == source.stat().st_size:
+        return
+    with jpeg.open("rb") as file:
+        file.seek(-min(len(JPEG_END), size), os.SEEK_END)
+        if file.read() != JPEG_END:
+            raise lack_of_space(jpeg.parent)
 
 
 def _write_mask(
@@ -150,7 +170,8 @@ def _write_mask(
     shown = cv2.resize(shown, size, interpolation=cv2.INTER_NEAREST)
     file = target / f"{image.name}.png"
     file.parent.mkdir(parents=True, exist_ok=True)
-    pycolmap.Bitmap.from_array(_undistort(shown, camera, options)).write(str(file))
+    if not pycolmap.Bitmap.from_array(_undistort(shown, camera, options)).write(str(file)):
+        raise lack_of_space(file.parent)
 
 
 def _undistort(

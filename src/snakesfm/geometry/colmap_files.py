@@ -86,6 +86,7 @@ def check_layout() -> None:
     Raises
     ------
     ConfigError : they differ.
+    OSError : there is no room for them; it names the temporary folder.
     """
     pixel, position, color, error, name = (1.5, 2.5), (3.0, 4.0, 5.0), (6, 7, 8), 0.25, "é .jpg"
     camera_id, image_id, point_id = 2, 3, 4
@@ -114,5 +115,9 @@ def check_layout() -> None:
     with tempfile.TemporaryDirectory(prefix="snakesfm.") as folder:
         model.write_binary(folder)
         for file, content in known.items():
-            if (Path(folder) / file).read_bytes() != content:
+            written = (Path(folder) / file).read_bytes()
+            # a disk without a free block holds nothing of so short a file
+            if not written:
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), tempfile.gettempdir())
+            if written != content:
                 raise ConfigError(OTHER_LAYOUT.format(version=pycolmap.__version__, file=file))

@@ -1,6 +1,7 @@
 """export_database: features, matches and two-view geometries as a COLMAP database."""
 
 import os
+import shutil
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,19 +23,33 @@ if TYPE_CHECKING:
     from snakesfm.config.export_database import ExportDatabaseOptions
 
 SIFT_SIZE = 128
+# what COLMAP's tables take before anything is in them, with room to spare
+EMPTY_DATABASE_BYTES = 1_000_000
 
 
 def run(job: StageJob) -> None:
-    """Write the database, complete or not at all, holding one block or tile in memory at a time."""
+    """Write the database, complete or not at all, holding one block or tile in memory at a time.
+
+    Raises
+    ------
+    OSError : the disk is full before the database has its tables; later SQLite ends the process.
+    """
     from snakesfm.export.database import write_cameras, write_images, write_positions
     from snakesfm.geometry.colmap_binding import pycolmap
+    from snakesfm.geometry.colmap_checks import lack_of_space
 
     options: ExportDatabaseOptions = job.options
     index = ImageIndex.read(job.path("index"))
     cameras = cameras_from_columns(*CalibratedCameras.read(job.path("cameras")).camera_columns)
     with temporary_folder(job.output.parent) as temporary:
         path = temporary / job.output.name
-        database = pycolmap.Database.open(path)
+        try:
+            database = pycolmap.Database.open(path)
+        except RuntimeError:
+            # pycolmap says no more than that it failed
+            if shutil.disk_usage(temporary).free < EMPTY_DATABASE_BYTES:
+                raise lack_of_space(job.output.parent) from None
+            raise
         try:
             with pycolmap.DatabaseTransaction(database):
                 write_cameras(database, cameras)

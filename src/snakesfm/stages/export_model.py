@@ -24,6 +24,7 @@ from snakesfm.export.placement import (
 )
 from snakesfm.export.undistorted import undistorted_share, write_undistorted
 from snakesfm.geometry.camera import Camera, cameras_from_columns
+from snakesfm.geometry.colmap_checks import check_binary, check_ply, check_text
 from snakesfm.geometry.lens_fit import MAX_MISFIT, fit_lenses
 from snakesfm.geometry.poses import has_pose, to_camera
 from snakesfm.ingest.masks import masks_as_large
@@ -299,13 +300,22 @@ def _build(
 
 
 def _write_colmap(folder: Path, number: int, model: "pycolmap.Reconstruction") -> None:
-    """One model, binary and as text; the points of the first as PLY too."""
+    """One model, binary and as text; the points of the first as PLY too.
+
+    Raises
+    ------
+    OSError : the disk is full.
+    """
     sparse = folder / "sparse" / str(number)
     sparse.mkdir(parents=True)
     model.write_binary(str(sparse))
     model.write_text(str(sparse))
+    check_binary(sparse, model)
+    check_text(sparse, model)
     if number == 0:
-        model.export_PLY(str(folder / "points.ply"))
+        ply = folder / "points.ply"
+        model.export_PLY(str(ply))
+        check_ply(ply, model.num_points3D())
 
 
 def _place_pictures(

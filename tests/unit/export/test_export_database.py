@@ -1,6 +1,9 @@
 """export_database: what COLMAP reads from it, and what its mapper makes of it."""
 
+import resource
+import shutil
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pycolmap
@@ -258,6 +261,23 @@ def test_descriptors_may_be_left_out(tmp_path: Path, problem: SyntheticProblem) 
     counts = database.num_keypoints(), database.num_descriptors()
     database.close()
     assert counts == (sum(map(len, problem.keypoints)), 0)
+
+
+@pytest.mark.parametrize(("free", "error"), [(0, "No space left"), (1 << 30, "No registered database")])
+def test_a_database_that_cannot_be_opened_on_a_full_disk_says_so(
+    tmp_path: Path, problem: SyntheticProblem, monkeypatch: pytest.MonkeyPatch, free: int, error: str
+) -> None:
+    job = job_of(tmp_path, write_inputs(tmp_path, problem))
+    monkeypatch.setattr(shutil, "disk_usage", lambda folder: SimpleNamespace(free=free))
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    # no file may hold more
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, hard))
+    try:
+        with pytest.raises((OSError, RuntimeError), match=error):
+            export_database.run(job)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert not job.output.exists()
 
 
 def test_a_fault_leaves_the_former_database_alone(tmp_path: Path, problem: SyntheticProblem) -> None:

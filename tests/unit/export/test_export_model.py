@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import resource
 import struct
 from pathlib import Path
 from types import SimpleNamespace
@@ -49,6 +50,30 @@ def test_colmap_reads_what_was_reconstructed_from_binary_and_text(tmp_path, prob
         row = np.flatnonzero(problem.track_image_ids[slice(*problem.track_offsets[4:6])] != LOST)[0]
         expected = problem.track_keypoints[problem.track_offsets[4] + row]
         assert observed.xy == pytest.approx(expected, abs=1e-5)
+
+
+@pytest.mark.parametrize("largest", [False, True])
+def test_a_model_that_does_not_fit_on_the_disk_is_not_published(tmp_path, problem, largest: bool) -> None:
+    """A limit on the size of a file ends a write as a full disk does."""
+    folder = export(tmp_path / "whole", problem)
+    sizes = sorted(path.stat().st_size for path in (folder / "sparse" / "0").iterdir())
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    # the inputs are written before the limit is set
+    make_images(tmp_path / "photos")
+    write = export_model._write_colmap
+
+    def write_limited(*arguments) -> None:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (sizes[-1] - 1 if largest else sizes[0], hard))
+        try:
+            write(*arguments)
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(export_model, "_write_colmap", write_limited)
+        with pytest.raises(OSError, match="No space left"):
+            export(tmp_path, problem)
+    assert [path.name for path in (tmp_path / "out" / "scene" / "export_model").iterdir()] == []
 
 
 def test_all_keypoints_are_numbered_as_the_features_are(tmp_path, problem) -> None:

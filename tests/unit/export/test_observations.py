@@ -13,6 +13,7 @@ from snakesfm.errors import ConfigError
 from snakesfm.export.colmap import build_reconstruction
 from snakesfm.geometry import colmap_files
 from snakesfm.geometry.camera import Camera
+from snakesfm.geometry.colmap_checks import check_binary, check_ply, check_text
 from snakesfm.geometry.poses import has_pose, to_rigid3d
 from snakesfm.synthetic.problems import make_problem
 
@@ -107,6 +108,26 @@ def files_of(model: pycolmap.Reconstruction, folder: Path) -> dict[str, bytes]:
     model.write_text(str(folder))
     model.export_PLY(str(folder / "points.ply"))
     return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+@pytest.mark.parametrize("number", [0, 1])
+def test_every_file_that_lacks_its_last_byte_is_found(tmp_path, number) -> None:
+    model = build_reconstruction(*list(parts())[number])
+
+    def check() -> None:
+        check_binary(tmp_path / "model", model)
+        check_text(tmp_path / "model", model)
+        check_ply(tmp_path / "model" / "points.ply", model.num_points3D())
+
+    contents = files_of(model, tmp_path / "model")
+    check()
+    for name, content in contents.items():
+        for room in (0, len(content) - 1):
+            (tmp_path / "model" / name).write_bytes(content[:room])
+            with pytest.raises(OSError, match="No space left"):
+                check()
+        (tmp_path / "model" / name).write_bytes(content)
+    check()
 
 
 @pytest.mark.parametrize("number", [0, 1])

@@ -112,6 +112,44 @@ def test_an_image_of_another_size_than_its_camera_is_named(tmp_path) -> None:
         undistort(tmp_path, "SIMPLE_RADIAL", DISTORTED["SIMPLE_RADIAL"], width=560)
 
 
+@pytest.mark.parametrize(
+    "file", ["images/a.jpg", *(f"sparse/{part}.bin" for part in ("cameras", "images", "rigs", "frames"))]
+)
+def test_files_that_colmap_has_no_room_for_are_found(
+    tmp_path, monkeypatch: pytest.MonkeyPatch, file: str
+) -> None:
+    write = pycolmap.undistort_images
+
+    def write_in_vain(target: str, *arguments, **options) -> None:
+        write(target, *arguments, **options)
+        cut = Path(target) / file
+        cut.write_bytes(cut.read_bytes()[:-1])
+
+    monkeypatch.setattr(pycolmap, "undistort_images", write_in_vain)
+    with pytest.raises(OSError, match="No space left"):
+        undistort(tmp_path, "SIMPLE_RADIAL", DISTORTED["SIMPLE_RADIAL"])
+
+
+def test_a_mask_that_cannot_be_written_is_no_success(tmp_path) -> None:
+    # a folder takes its place
+    (tmp_path / "flat" / "masks" / "a.png.png").mkdir(parents=True)
+    with pytest.raises(OSError, match="No space left"):
+        undistort(tmp_path, "SIMPLE_RADIAL", DISTORTED["SIMPLE_RADIAL"])
+
+
+def test_what_a_camera_appends_to_a_jpeg_is_copied_with_it(tmp_path, monkeypatch) -> None:
+    save = Image.Image.save
+
+    def save_and_append(image: Image.Image, file: Path, *arguments, **options) -> None:
+        save(image, file, *arguments, **options)
+        if file.suffix == ".jpg":
+            file.write_bytes(file.read_bytes() + b"of the maker")
+
+    monkeypatch.setattr(Image.Image, "save", save_and_append)
+    undistort(tmp_path, "PINHOLE", PERSPECTIVE["PINHOLE"])
+    assert (tmp_path / "flat" / "images" / "a.jpg").read_bytes().endswith(b"of the maker")
+
+
 @pytest.mark.parametrize("suffix", [".webp", ".png", ".tif", ".jpg"])
 def test_what_colmap_cannot_read_is_undistorted_too(tmp_path, suffix: str) -> None:
     images, sparse = tmp_path / "images", tmp_path / "sparse"
