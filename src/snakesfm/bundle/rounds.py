@@ -23,11 +23,11 @@ from snakesfm.bundle.interface import SolverSettings, bundle_adjuster
 from snakesfm.bundle.keypoint_noise import keypoint_noise_px
 from snakesfm.bundle.keypoint_refinement import refine_keypoints
 from snakesfm.bundle.lenses import find_wider_lenses, set_camera
-from snakesfm.bundle.principal_points import find_told_cameras
+from snakesfm.bundle.principal_points import find_told_cameras, shared_cameras
 from snakesfm.bundle.registration import left_out_images, register_left_out
 from snakesfm.bundle.round_settings import RoundRecord, RoundSettings
 from snakesfm.bundle.selection import adjust_selection
-from snakesfm.bundle.wild_cameras import WildCause, is_guessed, reset_wild_cameras, usual_focal_px
+from snakesfm.bundle.wild_cameras import WildCause, longest_focals_px, reset_wild_cameras
 from snakesfm.geometry.camera import Camera
 from snakesfm.geometry.colmap_binding import pycolmap
 
@@ -83,7 +83,7 @@ def adjust_rounds(
             mapper.round(f"round {number} with wider lenses", threshold, phase)
     while settings.register_images and mapper.register():
         mapper.round("registration", settings.thresholds_px[-1], "final")
-    if settings.refine_principal_points and settings.solver == "ceres":
+    if settings.refine_principal_points and settings.solver == "ceres" and not mapper.lenses_are_held:
         mapper.refine_principal_points(sources)
     mapper.drop_outliers()
     if settings.register_images:
@@ -196,7 +196,7 @@ class _Mapper:
     def widen_lenses(self) -> bool:
         """After a round, give cameras whose lens is not of their model a wider one; whether some were."""
         settings = self.settings
-        if not settings.widen_lenses or settings.solver != "ceres":
+        if not settings.widen_lenses or settings.solver != "ceres" or self.lenses_are_held:
             return False
         wider = find_wider_lenses(self.reconstruction, self.adjust, self.late_solving("final"))
         for camera_id, camera in wider.items():
@@ -214,7 +214,7 @@ class _Mapper:
         solving = self.late_solving("last")
         if not one_focal_serves(self.reconstruction, skewed, self.adjust, solving):
             return
-        # a model whose focal lengths were just changed does not show the noise of its keypoints
+        # what was just changed does not show the noise of its keypoints
         self.settings = replace(settings, loss_scale_px=solving.loss_scale_px)
         starts = list(self.cameras)
         for camera_id in skewed:
@@ -258,7 +258,7 @@ class _Mapper:
             cheap = CHEAP_STEPS // max(self.reconstruction.compute_num_observations(), 1)
             steps = max(solving.max_iterations, min(cheap, MOST_STEPS))
             solving = replace(solving, max_iterations=steps)
-        per_image = settings.early_observations if phase == "early" else settings.final_observations
+        per_image = settings.final_observations if phase == "last" else settings.early_observations
         if not per_image or self.reconstruction.num_reg_images() <= settings.select_above_images:
             return self.adjust(self.reconstruction, solving)
         return adjust_selection(self.reconstruction, self.adjust, solving, per_image, settings.seed)
@@ -270,11 +270,10 @@ class _Mapper:
         observations come back that the model before had bent or lost.
         """
         settings = self.settings
-        solving = replace(self.solving, loss_scale_px=self.loss_scale_px())
         found = find_told_cameras(
             self.reconstruction,
             self.adjust,
-            solving,
+            replace(self.solving, loss_scale_px=self.loss_scale_px()),
             settings.max_principal_point_gap,
             (settings.min_principal_point_offset, settings.max_principal_point_offset),
         )
@@ -307,6 +306,11 @@ class _Mapper:
             settings.min_track_length,
             settings.sparse_observations,
         )
+
+    @property
+    def lenses_are_held(self) -> bool:
+        """Whether the model could tell of no camera's lens: its noise need not be measured for that."""
+        return not shared_cameras(self.reconstruction, self.solving.constant_cameras)
 
     def loss_scale_px(self) -> float:
         """Where the loss of a final round sets in."""
@@ -350,12 +354,8 @@ class _Mapper:
 
     def set_long_lenses_aside(self) -> None:
         """Take out single images of lenses so long that the last pass would not settle them."""
-        longest = self.max_focals_px()
-        long = [
-            camera_id
-            for camera_id, most in longest.items()
-            if self.reconstruction.camera(camera_id).mean_focal_length() > LONG_LENS_SHARE * most
-        ]
+        focal_px = {k: camera.mean_focal_length() for k, camera in self.reconstruction.cameras.items()}
+        long = [k for k, most in self.max_focals_px().items() if focal_px[k] > LONG_LENS_SHARE * most]
         deregister_images_alone(self.reconstruction, long)
 
     def add_left_out(self) -> None:
@@ -391,8 +391,5 @@ class _Mapper:
         """The longest plausible focal length of each camera, by id, whose own is guessed and free."""
         if not self.solving.refine_focal:
             return {}
-        return {
-            row + 1: self.settings.max_guessed_focal_change * usual_focal_px(camera)
-            for row, camera in enumerate(self.cameras)
-            if is_guessed(camera) and row + 1 not in self.solving.constant_cameras
-        }
+        longest = longest_focals_px(self.cameras, self.settings.max_guessed_focal_change)
+        return {k: most for k, most in longest.items() if k not in self.solving.constant_cameras}

@@ -25,6 +25,15 @@ def is_guessed(camera: Camera) -> bool:
     return camera.source not in ("given", "exif")
 
 
+def longest_focals_px(cameras: Sequence[Camera], max_guessed_focal_change: float) -> dict[int, float]:
+    """The longest plausible focal length of each camera, by id, whose own is guessed."""
+    return {
+        row + 1: max_guessed_focal_change * usual_focal_px(camera)
+        for row, camera in enumerate(cameras)
+        if is_guessed(camera)
+    }
+
+
 def reset_wild_cameras(
     reconstruction: pycolmap.Reconstruction,
     cameras: Sequence[Camera],

@@ -11,7 +11,7 @@ from snakesfm.config.base import StageOptions
 class AdjustBundleOptions(StageOptions):
     """How cameras, poses and points are adjusted together."""
 
-    stage_version: ClassVar[int] = 18
+    stage_version: ClassVar[int] = 19
 
     solver: Literal["ceres", "gtsam"] = "ceres"
     """Least-squares solver: Ceres through pycolmap, or gtsam (slower, fewer camera models; principal
@@ -135,12 +135,12 @@ class AdjustBundleOptions(StageOptions):
     """Number of registered images above which the solver may work on a selection of the points."""
 
     early_observations: int = Field(default=300, ge=0)
-    """Observations per image used in early rounds of models with more than select_above_images images,
-    from the longest tracks; 0 uses all."""
+    """Observations per image used in all passes but the last of models with more than select_above_images
+    images, from the longest tracks; 0 uses all."""
 
     final_observations: int = Field(default=0, ge=0)
-    """Observations per image used in the last round and later ones of models with more than
-    select_above_images images; 0 uses all. 1000 takes less memory and costs a little accuracy."""
+    """Observations per image used in the last pass of models with more than select_above_images images;
+    0 uses all. 1000 takes less memory and costs a little accuracy."""
 
     max_iterations: Annotated[int, Field(ge=1, le=1_000_000)] | Literal["auto"] = "auto"
     """Solver iterations per pass; 'auto' is 50, up to 500 in small models, where they are cheap."""
