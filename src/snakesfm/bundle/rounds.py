@@ -12,6 +12,7 @@ from snakesfm.bundle.filtering import (
     filter_observations,
 )
 from snakesfm.bundle.focal_pairs import (
+    find_stretched_cameras,
     one_focal_serves,
     set_one_focal,
     skewed_cameras,
@@ -201,7 +202,8 @@ class _Mapper:
         told = number >= settings.distortion_from_round
         if not settings.widen_lenses or not told or settings.solver != "ceres":
             return False
-        wider = find_wider_lenses(self.reconstruction, self.adjust, self.late_solving("final"))
+        trying = self.reconstruction, self.adjust, self.late_solving("final")
+        wider = find_wider_lenses(*trying) or find_stretched_cameras(*trying)
         for camera_id, camera in wider.items():
             set_camera(self.reconstruction, camera_id, camera)
             # what went wild later would else go back to the former model
@@ -237,20 +239,11 @@ class _Mapper:
         held: Mapping[int, WildCause],
     ) -> None:
         """Take down what was done, and report it."""
-        self.reconstruction.update_point_3d_errors()
-        record = RoundRecord(
-            name,
-            costs,
-            (
-                self.reconstruction.num_reg_images(),
-                self.reconstruction.num_points3D(),
-                self.reconstruction.compute_num_observations(),
-            ),
-            float(self.reconstruction.compute_mean_reprojection_error()),
-            wild,
-            held,
-            self.far_principal_points,
-        )
+        model = self.reconstruction
+        model.update_point_3d_errors()
+        counts = model.num_reg_images(), model.num_points3D(), model.compute_num_observations()
+        error_px = float(model.compute_mean_reprojection_error())
+        record = RoundRecord(name, costs, counts, error_px, wild, held, self.far_principal_points)
         self.records.append(record)
         self.report(record)
 

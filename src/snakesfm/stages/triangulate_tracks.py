@@ -60,7 +60,7 @@ def run(job: StageJob) -> None:
     seen_twice = int(np.count_nonzero(np.add.reduceat(posed, tracks.offsets[:-1], dtype=np.int64) > 1))
     if good.sum() <= LEAST_SHARE * seen_twice:
         raise SceneError(
-            f"Scene '{job.scene}': {good.sum()} of {seen_twice} tracks can be triangulated with the averaged"
+            f"Scene '{job.scene}': {good.sum()} of {seen_twice} tracks can be triangulated with averaged"
             " poses: photographs all taken from one position, as for a panorama or by a camera on a tripod,"
             " show no depth; add some from other positions. Otherwise check the cameras' focal lengths, or"
             " lower triangulate_tracks.min_angle_deg or raise its max_reprojection_error_px."

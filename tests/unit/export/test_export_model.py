@@ -196,6 +196,15 @@ def test_a_far_principal_point_that_was_left_is_warned_of(
     assert all("lie 6.1% of the longer side away" in line for line in found)
 
 
+def test_a_camera_that_got_a_second_focal_length_is_warned_of() -> None:
+    stretched = Camera("OPENCV", 640, 480, (600.0, 450.0, 320.0, 240.0, 0.0, 0.0, 0.0, 0.0))
+    former = ["SIMPLE_RADIAL", "SIMPLE_RADIAL", "OPENCV"]
+    found = export_model._stretched_warnings({0: CAMERA, 1: stretched, 2: stretched}, former)
+    # what was given or chosen is known
+    assert [line.split(" (fx")[0] for line in found] == ["camera 2 (OPENCV): its pixels are not square"]
+    assert "fx / fy = 1.33" in found[0]
+
+
 @pytest.mark.parametrize(
     ("lens", "told"),
     [(CAMERA, 0), (dataclasses.replace(CAMERA, model="FOV", params=(250.0, 250.0, 320.0, 240.0, 1.4)), 2)],
