@@ -33,6 +33,8 @@ MAX_SKEW = 0.02
 SQUARE = 1e-6
 MAX_ERROR_RATIO = 1.05
 """Of mean reprojection errors with one focal length and with two, where one does as well."""
+STRETCHED_ERROR_RATIO = 1.25
+"""The same, where pixels are surely not square: more freedom also fits what else is wrong better."""
 STRETCHED_MODELS = {"SIMPLE_RADIAL": "OPENCV"}
 """Of models of one focal length what shows pixels that are not square."""
 # more points tell no more of two numbers, and cost time
@@ -66,7 +68,9 @@ def find_stretched_cameras(
     adjust(trial, solving)
     found = {k: Camera.of_pycolmap(trial.camera(k)) for k in starts}
     found = {k: camera for k, camera in found.items() if _skew(camera) > MAX_SKEW}
-    return {} if not found or one_focal_serves(trial, found, adjust, solving) else found
+    if not found or one_focal_serves(trial, found, adjust, solving, STRETCHED_ERROR_RATIO):
+        return {}
+    return found
 
 
 def skewed_cameras(reconstruction: pycolmap.Reconstruction, cameras: Sequence[Camera]) -> list[int]:
@@ -91,6 +95,7 @@ def one_focal_serves(
     camera_ids: Collection[int],
     adjust: BundleAdjuster,
     solving: SolverSettings,
+    max_error_ratio: float = MAX_ERROR_RATIO,
 ) -> bool:
     """Whether cameras explain their images about as well with one focal length.
 
@@ -99,6 +104,7 @@ def one_focal_serves(
     reconstruction : an adjusted model; stays as it is.
     camera_ids : of cameras of two focal lengths.
     adjust, solving : the solver.
+    max_error_ratio : of mean reprojection errors with one focal length and with two, what is as well.
     """
     trial = pycolmap.Reconstruction(reconstruction)
     for camera_id in camera_ids:
@@ -108,7 +114,7 @@ def one_focal_serves(
     for model in (reconstruction, trial):
         model.update_point_3d_errors()
         errors.append(model.compute_mean_reprojection_error())
-    return bool(errors[1] <= MAX_ERROR_RATIO * errors[0])
+    return bool(errors[1] <= max_error_ratio * errors[0])
 
 
 def set_one_focal(reconstruction: pycolmap.Reconstruction, camera_id: int) -> None:

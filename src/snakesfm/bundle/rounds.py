@@ -24,6 +24,7 @@ from snakesfm.bundle.interface import SolverSettings, bundle_adjuster
 from snakesfm.bundle.keypoint_noise import keypoint_noise_px
 from snakesfm.bundle.keypoint_refinement import refine_keypoints
 from snakesfm.bundle.lenses import find_wider_lenses, set_camera
+from snakesfm.bundle.mixed_focals import find_mixed_focals
 from snakesfm.bundle.principal_points import find_told_cameras
 from snakesfm.bundle.registration import left_out_images, register_left_out
 from snakesfm.bundle.round_settings import RoundRecord, RoundSettings
@@ -88,6 +89,7 @@ def adjust_rounds(
     if settings.refine_principal_points and settings.solver == "ceres":
         mapper.refine_principal_points(sources)
     mapper.drop_outliers()
+    mapper.look_for_mixed_focals()
     if settings.register_images:
         mapper.set_long_lenses_aside()
     mapper.round("last pass", settings.thresholds_px[-1], "last")
@@ -116,7 +118,8 @@ class _Mapper:
         self.report = report
         self.records: list[RoundRecord] = []
         self.registered_late: set[int] = set()
-        self.far_principal_points: Mapping[int, float] = {}
+        self.far: Mapping[int, float] = {}
+        self.mixed: Mapping[int, float] = {}
         self.adjust = bundle_adjuster(settings.solver)
         self.held_graph: pycolmap.CorrespondenceGraph | None = None
 
@@ -243,7 +246,7 @@ class _Mapper:
         model.update_point_3d_errors()
         counts = model.num_reg_images(), model.num_points3D(), model.compute_num_observations()
         error_px = float(model.compute_mean_reprojection_error())
-        record = RoundRecord(name, costs, counts, error_px, wild, held, self.far_principal_points)
+        record = RoundRecord(name, costs, counts, error_px, wild, held, self.far, self.mixed)
         self.records.append(record)
         self.report(record)
 
@@ -267,14 +270,10 @@ class _Mapper:
         """
         settings = self.settings
         solving = replace(self.solving, loss_scale_px=self.loss_scale_px())
-        found = find_told_cameras(
-            self.reconstruction,
-            self.adjust,
-            solving,
-            settings.max_principal_point_gap,
-            (settings.min_principal_point_offset, settings.max_principal_point_offset),
-        )
-        self.far_principal_points = found.refused
+        offsets = settings.min_principal_point_offset, settings.max_principal_point_offset
+        trying = self.reconstruction, self.adjust, solving
+        found = find_told_cameras(*trying, settings.max_principal_point_gap, offsets)
+        self.far = found.refused
         if not found.told:
             return
         before = self.solving
@@ -287,6 +286,11 @@ class _Mapper:
             self.round("principal points again", settings.thresholds_px[-1], "final")
             settled = not self.records[-1].error_px < SETTLED_SHARE * self.records[-2].error_px
         self.solving = before
+
+    def look_for_mixed_focals(self) -> None:
+        """See which images share a camera though their focal lengths differ."""
+        if self.settings.solver == "ceres":
+            self.mixed = find_mixed_focals(self.reconstruction, self.adjust, self.late_solving("final"))
 
     def drop_outliers(self) -> None:
         """Drop observations so far off that the keypoints' noise does not explain them."""

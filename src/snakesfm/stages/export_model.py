@@ -74,6 +74,12 @@ FAR_PRINCIPAL_POINT = (
     "cropped, give cameras=, or raise adjust_bundle.max_principal_point_offset."
 )
 
+MIXED_FOCALS = (
+    "camera {camera} ({model}): its images seem to differ in focal length by {spread:.0%}, as by zoom or "
+    "of several cameras whose EXIF is lost: put those of each into a folder and set "
+    "index_images={{camera_sharing: per_folder}}, or per_image if you cannot tell them apart."
+)
+
 STRETCHED = (
     "camera {camera} ({model}): its pixels are not square (fx / fy = {ratio:.2f}), as of frames of "
     "anamorphic video or images stretched to a size; images in their true proportions give better models."
@@ -187,6 +193,11 @@ def _camera_warnings(adjusted: Reconstruction, cameras: dict[int, Camera]) -> li
         FAR_PRINCIPAL_POINT.format(camera=row + 1, model=camera.model, offset=adjusted.camera_offsets[row])
         for row, camera in cameras.items()
         if np.isfinite(adjusted.camera_offsets[row])
+    ]
+    by_kind["mixed"] = [
+        MIXED_FOCALS.format(camera=row + 1, model=camera.model, spread=adjusted.camera_spreads[row])
+        for row, camera in cameras.items()
+        if np.isfinite(adjusted.camera_spreads[row])
     ]
     return [line for lines in by_kind.values() for line in _some_cameras(lines)]
 
