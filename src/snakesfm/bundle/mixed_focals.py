@@ -13,8 +13,9 @@ MAX_SPREAD = 0.02
 """Of focal lengths of one camera, the ninth decile over the first, less one: focusing changes less."""
 NOISE_SHARE = 0.7
 """Of the errors, what a camera for each image must leave at most: freedom alone takes a few per cent."""
-# more points tell no more of a few numbers, and cost time
-MAX_POINTS = 2500
+# each image must see enough of them to tell its own focal length, and more cost time
+POINTS_PER_IMAGE = 15
+LEAST_POINTS = 2500
 
 
 def find_mixed_focals(
@@ -34,7 +35,8 @@ def find_mixed_focals(
         return {}
     tracks, pixels = read_tracks_and_pixels(reconstruction)
     chosen = np.zeros(len(tracks.points), dtype=bool)
-    chosen[:: -(-len(chosen) // MAX_POINTS) or 1] = True
+    wanted = max(LEAST_POINTS, POINTS_PER_IMAGE * reconstruction.num_reg_images())
+    chosen[:: -(-len(chosen) // wanted) or 1] = True
     before = with_points(reconstruction, tracks, pixels, chosen)
     after = with_points(reconstruction, tracks, pixels, chosen, shared)
     adjust(after, solving)
