@@ -91,6 +91,7 @@ def write_reconstruction(
     reset: str = "",
     offset: float = np.nan,
     second: Iterable[int] = (),
+    spread: float = np.nan,
 ) -> Path:
     """The truth as a finished model, ``lost`` images not registered, those of a ``second`` model apart.
 
@@ -114,6 +115,7 @@ def write_reconstruction(
         camera_params=params,
         camera_resets=["", reset],
         camera_offsets=np.array([np.nan, offset]),
+        camera_spreads=np.array([np.nan, spread]),
         rotations=rotations,
         translations=translations,
         models=np.where(np.isin(np.arange(COUNT), list(lost)), -1, model_of),
@@ -171,13 +173,14 @@ def export(
     offset: float = np.nan,
     second: Iterable[int] = (),
     intrinsics: str = "refine",
+    spread: float = np.nan,
     **options: bool,
 ) -> Path:
     inputs = {
         "index": str(write_index(tmp_path, orientations, gps)),
         "cameras": str(write_cameras(tmp_path)),
         "features": [str(write_features(tmp_path, problem))],
-        "reconstruction": str(write_reconstruction(tmp_path, problem, lost, reset, offset, second)),
+        "reconstruction": str(write_reconstruction(tmp_path, problem, lost, reset, offset, second, spread)),
     }
     folder = tmp_path / "out" / "scene" / "export_model"
     images = tmp_path / "photos"

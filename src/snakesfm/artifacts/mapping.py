@@ -80,7 +80,7 @@ class Reconstruction(Artifact):
     """The adjusted model: cameras, poses, points and observations."""
 
     kind: ClassVar[str] = "reconstruction"
-    format_version: ClassVar[int] = 5
+    format_version: ClassVar[int] = 6
 
     camera_models: Array = column("(C)", "str", "COLMAP camera model name")
     camera_sizes: Array = column("(C,2)", "int32", "width and height in pixels")
@@ -92,6 +92,9 @@ class Reconstruction(Artifact):
         "(C)",
         "float64",
         "how far off a principal point seems that was left, relative to the longer side",
+    )
+    camera_spreads: Array = column(
+        "(C)", "float64", "by how much the images of a camera seem to differ in focal length, NaN if not"
     )
     rotations: Array = column("(N,3,3)", "float64", "cam_from_world; NaN where not registered")
     translations: Array = column("(N,3)", "float64", "cam_from_world; NaN where not registered")

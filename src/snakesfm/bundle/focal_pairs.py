@@ -3,14 +3,20 @@
 Where all cameras stand upright at one height, as around an object or along a street, the vertical focal
 length trades with the height of the world: nothing in the images tells the two apart. Most pixels are
 square, so two focal lengths that come out different are a sign of it, if one does as well. Where pixels are
-not, as of anamorphic video, the images tell.
+not, as of anamorphic video or images stretched to a size, the images tell, also cameras that began with one
+focal length.
 """
 
 from collections.abc import Collection, Sequence
 from dataclasses import replace
 
+import numpy as np
+
 from snakesfm.bundle.interface import BundleAdjuster, SolverSettings
 from snakesfm.bundle.lenses import set_camera
+from snakesfm.bundle.principal_points import shared_cameras
+from snakesfm.bundle.reading import read_tracks_and_pixels
+from snakesfm.bundle.selection import with_points
 from snakesfm.geometry.camera import Camera
 from snakesfm.geometry.colmap_binding import pycolmap
 
@@ -27,6 +33,44 @@ MAX_SKEW = 0.02
 SQUARE = 1e-6
 MAX_ERROR_RATIO = 1.05
 """Of mean reprojection errors with one focal length and with two, where one does as well."""
+STRETCHED_ERROR_RATIO = 1.25
+"""The same, where pixels are surely not square: more freedom also fits what else is wrong better."""
+STRETCHED_MODELS = {"SIMPLE_RADIAL": "OPENCV"}
+"""Of models of one focal length what shows pixels that are not square."""
+# more points tell no more of two numbers, and cost time
+MAX_POINTS = 2500
+
+
+def find_stretched_cameras(
+    reconstruction: pycolmap.Reconstruction, adjust: BundleAdjuster, solving: SolverSettings
+) -> dict[int, Camera]:
+    """Cameras of one focal length by id whose pixels are not square, with a model and parameters of two.
+
+    One focal length bends the model so that its errors hardly show what is wrong: two are tried, on some of
+    the points, and taken where they come apart and one does not do as well.
+
+    Parameters
+    ----------
+    reconstruction : an adjusted model with free distortion; stays as it is.
+    adjust, solving : the solver; cameras that it holds, or of few images, are no candidates.
+    """
+    shared = sorted(shared_cameras(reconstruction, solving.constant_cameras))
+    starts = {k: Camera.of_pycolmap(reconstruction.camera(k)) for k in shared}
+    starts = {k: camera for k, camera in starts.items() if camera.model in STRETCHED_MODELS}
+    if not starts:
+        return {}
+    tracks, pixels = read_tracks_and_pixels(reconstruction)
+    chosen = np.zeros(len(tracks.points), dtype=bool)
+    chosen[:: -(-len(chosen) // MAX_POINTS) or 1] = True
+    trial = with_points(reconstruction, tracks, pixels, chosen)
+    for camera_id, camera in starts.items():
+        set_camera(trial, camera_id, with_two_focals(camera, STRETCHED_MODELS[camera.model]))
+    adjust(trial, solving)
+    found = {k: Camera.of_pycolmap(trial.camera(k)) for k in starts}
+    found = {k: camera for k, camera in found.items() if _skew(camera) > MAX_SKEW}
+    if not found or one_focal_serves(trial, found, adjust, solving, STRETCHED_ERROR_RATIO):
+        return {}
+    return found
 
 
 def skewed_cameras(reconstruction: pycolmap.Reconstruction, cameras: Sequence[Camera]) -> list[int]:
@@ -51,6 +95,7 @@ def one_focal_serves(
     camera_ids: Collection[int],
     adjust: BundleAdjuster,
     solving: SolverSettings,
+    max_error_ratio: float = MAX_ERROR_RATIO,
 ) -> bool:
     """Whether cameras explain their images about as well with one focal length.
 
@@ -59,6 +104,7 @@ def one_focal_serves(
     reconstruction : an adjusted model; stays as it is.
     camera_ids : of cameras of two focal lengths.
     adjust, solving : the solver.
+    max_error_ratio : of mean reprojection errors with one focal length and with two, what is as well.
     """
     trial = pycolmap.Reconstruction(reconstruction)
     for camera_id in camera_ids:
@@ -68,7 +114,7 @@ def one_focal_serves(
     for model in (reconstruction, trial):
         model.update_point_3d_errors()
         errors.append(model.compute_mean_reprojection_error())
-    return bool(errors[1] <= MAX_ERROR_RATIO * errors[0])
+    return bool(errors[1] <= max_error_ratio * errors[0])
 
 
 def set_one_focal(reconstruction: pycolmap.Reconstruction, camera_id: int) -> None:

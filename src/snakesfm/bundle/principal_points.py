@@ -131,12 +131,18 @@ def _adjusted_half(
     return model
 
 
-def _median_errors(reconstruction: pycolmap.Reconstruction) -> dict[int, float]:
-    """Median reprojection errors in pixels, by the ids of the cameras that have observations."""
+def observation_errors(reconstruction: pycolmap.Reconstruction) -> tuple[Array, Array]:
+    """Id of the camera (L,) int64 of each observation, and its reprojection error (L,) in pixels."""
     tracks, pixels = read_tracks_and_pixels(reconstruction)
     camera_of, in_camera = points_in_cameras(reconstruction, tracks)
-    medians = {}
+    errors = np.zeros(len(camera_of))
     for camera_id, mine in rows_of_each(camera_of):
         seen = reconstruction.camera(camera_id).img_from_cam(in_camera[mine])
-        medians[int(camera_id)] = float(np.median(np.linalg.norm(seen - pixels[mine], axis=1)))
-    return medians
+        errors[mine] = np.linalg.norm(seen - pixels[mine], axis=1)
+    return camera_of, errors
+
+
+def _median_errors(reconstruction: pycolmap.Reconstruction) -> dict[int, float]:
+    """Median reprojection errors in pixels, by the ids of the cameras that have observations."""
+    camera_of, errors = observation_errors(reconstruction)
+    return {int(camera_id): float(np.median(errors[mine])) for camera_id, mine in rows_of_each(camera_of)}

@@ -58,7 +58,8 @@ class RoundRecord:
     Where nothing was adjusted, the costs are that of the pass before. ``wild`` tells by the camera's id
     what was not plausible of cameras that were reset, and ``held`` the same of those that are held since.
     ``far`` tells by the camera's id how far from where it is left the principal point seems to be, as a
-    share of the longer side, where that was not believed.
+    share of the longer side, where that was not believed; ``mixed`` likewise by how much the images of a
+    camera differ in focal length.
     """
 
     name: str
@@ -68,3 +69,4 @@ class RoundRecord:
     wild: Mapping[int, WildCause]
     held: Mapping[int, WildCause]
     far: Mapping[int, float]
+    mixed: Mapping[int, float]

@@ -12,6 +12,7 @@ from snakesfm.bundle.filtering import (
     filter_observations,
 )
 from snakesfm.bundle.focal_pairs import (
+    find_stretched_cameras,
     one_focal_serves,
     set_one_focal,
     skewed_cameras,
@@ -23,6 +24,7 @@ from snakesfm.bundle.interface import SolverSettings, bundle_adjuster
 from snakesfm.bundle.keypoint_noise import keypoint_noise_px
 from snakesfm.bundle.keypoint_refinement import refine_keypoints
 from snakesfm.bundle.lenses import find_wider_lenses, set_camera
+from snakesfm.bundle.mixed_focals import find_mixed_focals
 from snakesfm.bundle.principal_points import find_told_cameras, shared_cameras
 from snakesfm.bundle.registration import left_out_images, register_left_out
 from snakesfm.bundle.round_settings import RoundRecord, RoundSettings
@@ -86,6 +88,7 @@ def adjust_rounds(
     if settings.refine_principal_points and settings.solver == "ceres" and not mapper.lenses_are_held:
         mapper.refine_principal_points(sources)
     mapper.drop_outliers()
+    mapper.look_for_mixed_focals()
     if settings.register_images:
         mapper.set_long_lenses_aside()
     mapper.round("last pass", settings.thresholds_px[-1], "last")
@@ -114,7 +117,8 @@ class _Mapper:
         self.report = report
         self.records: list[RoundRecord] = []
         self.registered_late: set[int] = set()
-        self.far_principal_points: Mapping[int, float] = {}
+        self.far: Mapping[int, float] = {}
+        self.mixed: Mapping[int, float] = {}
         self.adjust = bundle_adjuster(settings.solver)
         self.held_graph: pycolmap.CorrespondenceGraph | None = None
 
@@ -198,7 +202,8 @@ class _Mapper:
         settings = self.settings
         if not settings.widen_lenses or settings.solver != "ceres" or self.lenses_are_held:
             return False
-        wider = find_wider_lenses(self.reconstruction, self.adjust, self.late_solving("final"))
+        trying = self.reconstruction, self.adjust, self.late_solving("final")
+        wider = find_wider_lenses(*trying) or find_stretched_cameras(*trying)
         for camera_id, camera in wider.items():
             set_camera(self.reconstruction, camera_id, camera)
             # what went wild later would else go back to the former model
@@ -234,20 +239,11 @@ class _Mapper:
         held: Mapping[int, WildCause],
     ) -> None:
         """Take down what was done, and report it."""
-        self.reconstruction.update_point_3d_errors()
-        record = RoundRecord(
-            name,
-            costs,
-            (
-                self.reconstruction.num_reg_images(),
-                self.reconstruction.num_points3D(),
-                self.reconstruction.compute_num_observations(),
-            ),
-            float(self.reconstruction.compute_mean_reprojection_error()),
-            wild,
-            held,
-            self.far_principal_points,
-        )
+        model = self.reconstruction
+        model.update_point_3d_errors()
+        counts = model.num_reg_images(), model.num_points3D(), model.compute_num_observations()
+        error_px = float(model.compute_mean_reprojection_error())
+        record = RoundRecord(name, costs, counts, error_px, wild, held, self.far, self.mixed)
         self.records.append(record)
         self.report(record)
 
@@ -270,14 +266,11 @@ class _Mapper:
         observations come back that the model before had bent or lost.
         """
         settings = self.settings
-        found = find_told_cameras(
-            self.reconstruction,
-            self.adjust,
-            replace(self.solving, loss_scale_px=self.loss_scale_px()),
-            settings.max_principal_point_gap,
-            (settings.min_principal_point_offset, settings.max_principal_point_offset),
-        )
-        self.far_principal_points = found.refused
+        solving = replace(self.solving, loss_scale_px=self.loss_scale_px())
+        offsets = settings.min_principal_point_offset, settings.max_principal_point_offset
+        trying = self.reconstruction, self.adjust, solving
+        found = find_told_cameras(*trying, settings.max_principal_point_gap, offsets)
+        self.far = found.refused
         if not found.told:
             return
         before = self.solving
@@ -290,6 +283,11 @@ class _Mapper:
             self.round("principal points again", settings.thresholds_px[-1], "final")
             settled = not self.records[-1].error_px < SETTLED_SHARE * self.records[-2].error_px
         self.solving = before
+
+    def look_for_mixed_focals(self) -> None:
+        """See which images share a camera though their focal lengths differ."""
+        if self.settings.solver == "ceres" and not self.lenses_are_held:
+            self.mixed = find_mixed_focals(self.reconstruction, self.adjust, self.late_solving("final"))
 
     def drop_outliers(self) -> None:
         """Drop observations so far off that the keypoints' noise does not explain them."""

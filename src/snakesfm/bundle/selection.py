@@ -1,5 +1,7 @@
 """Adjustment of large models with a selection of their points; the others follow with fixed cameras."""
 
+from collections.abc import Container
+
 import numpy as np
 
 from snakesfm.arrays import Array
@@ -88,7 +90,11 @@ def adjust_selection(
 
 
 def with_points(
-    reconstruction: pycolmap.Reconstruction, tracks: Tracks, pixels: Array, chosen: Array
+    reconstruction: pycolmap.Reconstruction,
+    tracks: Tracks,
+    pixels: Array,
+    chosen: Array,
+    split: Container[int] = (),
 ) -> pycolmap.Reconstruction:
     """The cameras and poses with some of the points, and only the keypoints that observe them.
 
@@ -97,19 +103,23 @@ def with_points(
     reconstruction : gives the cameras and poses.
     tracks, pixels : its observations, see :func:`read_tracks_and_pixels`.
     chosen : (T,) bool, the points.
+    split : ids of cameras of which each image gets a copy of its own.
     """
     mine = chosen[tracks.point_rows]
     images = tracks.images[mine]
     count = max(reconstruction.images)
     camera_ids = np.zeros(count, dtype=np.int64)
     rotations, translations = np.full((count, 3, 3), np.nan), np.full((count, 3), np.nan)
-    for image_id, image in reconstruction.images.items():
+    camera_count = max(reconstruction.cameras)
+    cameras = [Camera.of_pycolmap(reconstruction.camera(row + 1)) for row in range(camera_count)]
+    for image_id, image in sorted(reconstruction.images.items()):
         camera_ids[image_id - 1] = image.camera_id - 1
+        if image.camera_id in split:
+            camera_ids[image_id - 1] = len(cameras)
+            cameras.append(cameras[image.camera_id - 1])
         if image.has_pose:
             pose = image.cam_from_world()
             rotations[image_id - 1], translations[image_id - 1] = pose.rotation.matrix(), pose.translation
-    camera_count = max(reconstruction.cameras)
-    cameras = [Camera.of_pycolmap(reconstruction.camera(row + 1)) for row in range(camera_count)]
     keypoints, keypoint_ids = keypoints_of_observations(images, pixels[mine], count)
     lengths = np.bincount(tracks.point_rows, minlength=len(chosen))[chosen]
     model = BundleModel(

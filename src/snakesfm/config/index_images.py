@@ -29,8 +29,8 @@ class IndexImagesOptions(StageOptions):
         "SIMPLE_RADIAL_FISHEYE",
         "RADIAL_FISHEYE",
     ] = "auto"
-    """COLMAP camera model of cameras without known intrinsics; 'auto' is SIMPLE_RADIAL, or
-    OPENCV_FISHEYE if the lens needs it."""
+    """COLMAP camera model of cameras without known intrinsics; 'auto' is SIMPLE_RADIAL,
+    OPENCV_FISHEYE if the lens needs it, or OPENCV if pixels are not square."""
 
     use_exif_focal: bool = True
     """Start focal lengths from EXIF and COLMAP's sensor database, except for cropped images."""

@@ -78,6 +78,7 @@ def run(job: StageJob) -> None:
     records: list[RoundRecord] = []
     resets: dict[int, WildCause] = {}
     far: dict[int, float] = {}
+    mixed: dict[int, float] = {}
     for component in range(int(averaged.components.max(initial=0)) + 1):
         mine = (averaged.components == component) & ~taken
         part = restrict_to(replace(poses, cameras=cameras), mine)
@@ -97,6 +98,7 @@ def run(job: StageJob) -> None:
         if result.registered.sum() >= 2:
             resets |= rounds[-1].held
             far |= rounds[-1].far
+            mixed |= rounds[-1].mixed
             cameras = result.cameras
             adjusted.append((result, observed))
             taken |= result.registered
@@ -112,7 +114,7 @@ def run(job: StageJob) -> None:
     joined, models = join_models([found for found, _ in adjusted], final)
     pixels = np.concatenate([observed for _, observed in adjusted])
     scales = detector_scales(index.sizes, job.settings).astype(np.float32)
-    _write(job, joined, models, pixels * scales[joined.image_ids, None], records, resets, far)
+    _write(job, joined, models, pixels * scales[joined.image_ids, None], records, resets, far, mixed)
 
 
 def _adjust(
@@ -262,6 +264,7 @@ def _write(
     records: list[RoundRecord],
     resets: dict[int, WildCause],
     far: dict[int, float],
+    mixed: dict[int, float],
 ) -> None:
     (colors,) = gather_image_columns(job.paths("features"), len(model.camera_ids), "colors")
     base = offsets_of([len(k) for k in colors])
@@ -274,6 +277,7 @@ def _write(
         camera_params=params,
         camera_resets=np.array([resets.get(camera_id, "") for camera_id in ids]),
         camera_offsets=np.array([far.get(camera_id, np.nan) for camera_id in ids]),
+        camera_spreads=np.array([mixed.get(camera_id, np.nan) for camera_id in ids]),
         rotations=model.rotations,
         translations=model.translations,
         models=models,

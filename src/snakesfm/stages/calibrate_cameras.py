@@ -33,6 +33,11 @@ if TYPE_CHECKING:
 GIVEN_SIGMA = 0.0
 # a model of fewer hardly tells focal lengths and distortion apart
 LEAST_IMAGES = 5
+# matches of images taken from one place, as of bursts and slow video, move less in the median: such pairs
+# match best and tell no focal length
+MOVED_PX = 3.0
+# how often others are chosen instead of such pairs
+MOST_CHOICES = 100
 # more pairs show no other overlay, and cost time
 OVERLAY_PAIRS = 3000
 OVERLAY = (
@@ -87,14 +92,15 @@ def _calibrate(
 
     options: CalibrateCamerasOptions = job.options
     given = np.array([camera.source == "given" for camera in cameras], dtype=bool)
-    chosen = choose_pairs(
-        matched.pairs,
-        matched.counts,
-        index.camera_ids,
-        ~given,
-        options.pairs_per_camera,
-        options.min_matches,
-    )
+    counts = matched.counts.copy()
+    for _ in range(MOST_CHOICES):
+        chosen = choose_pairs(
+            matched.pairs, counts, index.camera_ids, ~given, options.pairs_per_camera, options.min_matches
+        )
+        still = matched.still_pairs(chosen, MOVED_PX)
+        if not len(still):
+            break
+        counts[still] = 0
     progress = job.progress(len(chosen), "pairs")
     pairs: dict[int, MatchedPair] = {}
     for row, first, second in matched.read(chosen):
@@ -224,6 +230,7 @@ class _MatchedImages:
         self._scales = detector_scales(index.sizes, job.settings)
         self.sizes = detector_sizes(index.sizes, job.settings)
         self._keypoints: dict[int, Array] = {}
+        self._moved_px: dict[int, float] = {}
 
     def read(self, rows: Array) -> Iterator[tuple[int, Array, Array]]:
         """Some rows, file by file, and their matched keypoints (K,2) in detector pixels, best first."""
@@ -236,6 +243,13 @@ class _MatchedImages:
             # best first: the estimator draws from the first ones sooner
             best = matches[np.argsort(-scores, kind="stable")]
             yield row, self._keypoints[i][best[:, 0]], self._keypoints[j][best[:, 1]]
+
+    def still_pairs(self, rows: Array, least_px: float) -> Array:
+        """Those of some rows whose matches move less in the median; each pair is looked at once."""
+        looked_at = self._moved_px
+        for row, first, second in self.read(rows[[row not in looked_at for row in rows.tolist()]]):
+            looked_at[row] = float(np.median(np.linalg.norm(first - second, axis=1)))
+        return rows[[looked_at[row] < least_px for row in rows.tolist()]]
 
     def deal(self, rows: Array, count: int) -> list[PairMatches]:
         """Some rows, ascending, in up to so many artifacts, none of them empty."""

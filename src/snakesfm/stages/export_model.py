@@ -12,6 +12,7 @@ import numpy as np
 
 from snakesfm.artifacts import CalibratedCameras, ImageIndex, Reconstruction, temporary_folder
 from snakesfm.artifacts.gather import gather_image_columns
+from snakesfm.bundle.focal_pairs import STRETCHED_MODELS
 from snakesfm.export.colmap import build_reconstruction, other_model_sizes, summarize
 from snakesfm.export.image_folder import place_images
 from snakesfm.export.nerfstudio import camera_warnings, transforms
@@ -78,6 +79,17 @@ FAR_PRINCIPAL_POINT = (
     "camera {camera} ({model}): its principal point seems to lie {offset:.1%} of the longer side away from "
     "where it is assumed, but reprojection errors hardly fall there, so it was left; if the images were "
     "cropped, give cameras=, or raise adjust_bundle.max_principal_point_offset."
+)
+
+MIXED_FOCALS = (
+    "camera {camera} ({model}): its images seem to differ in focal length by {spread:.0%}, as by zoom or "
+    "of several cameras whose EXIF is lost: put those of each into a folder and set "
+    "index_images={{camera_sharing: per_folder}}, or per_image if you cannot tell them apart."
+)
+
+STRETCHED = (
+    "camera {camera} ({model}): its pixels are not square (fx / fy = {ratio:.2f}), as of frames of "
+    "anamorphic video or images stretched to a size; images in their true proportions give better models."
 )
 
 CUT_PICTURE = (
@@ -166,7 +178,9 @@ def _warnings(
     if len(index.refused_names):
         warnings.append(REFUSED.format(count=len(index.refused_names), first=index.refused_reasons[0]))
     warnings += [str(line) for line in index.warnings]
-    warnings += [str(line) for line in CalibratedCameras.read(job.path("cameras")).warnings]
+    calibrated = CalibratedCameras.read(job.path("cameras"))
+    warnings += _stretched_warnings(used, [str(model) for model in calibrated.models])
+    warnings += [str(line) for line in calibrated.warnings]
     warnings += placement_warnings(placements, names, job.options.georeference is True)
     # a list of pairs may name copies, which then are images as any other
     copies = int(np.count_nonzero((index.duplicate_of >= 0) & (adjusted.models < 0)))
@@ -188,6 +202,11 @@ def _camera_warnings(adjusted: Reconstruction, cameras: dict[int, Camera]) -> li
         FAR_PRINCIPAL_POINT.format(camera=row + 1, model=camera.model, offset=adjusted.camera_offsets[row])
         for row, camera in cameras.items()
         if np.isfinite(adjusted.camera_offsets[row])
+    ]
+    by_kind["mixed"] = [
+        MIXED_FOCALS.format(camera=row + 1, model=camera.model, spread=adjusted.camera_spreads[row])
+        for row, camera in cameras.items()
+        if np.isfinite(adjusted.camera_spreads[row])
     ]
     return [line for lines in by_kind.values() for line in _some_cameras(lines)]
 
@@ -216,6 +235,17 @@ def _lens_warnings(
             )
             for row, fit in fits.items()
             if fit.misfit > MAX_MISFIT
+        ]
+    )
+
+
+def _stretched_warnings(cameras: dict[int, Camera], former: list[str]) -> list[str]:
+    """A sentence per camera, given by its row, that bundle adjustment gave a second focal length."""
+    return _some_cameras(
+        [
+            STRETCHED.format(camera=row + 1, model=camera.model, ratio=camera.params[0] / camera.params[1])
+            for row, camera in cameras.items()
+            if camera.model == STRETCHED_MODELS.get(former[row])
         ]
     )
 

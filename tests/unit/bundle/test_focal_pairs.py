@@ -18,6 +18,7 @@ from snakesfm.bundle.interface import SolverSettings
 from snakesfm.bundle.model import to_reconstruction
 from snakesfm.bundle.rounds import bundle_adjuster
 from snakesfm.geometry.camera import Camera
+from snakesfm.geometry.rotations import angle_of
 from snakesfm.synthetic import layouts
 from snakesfm.synthetic.problems import make_problem
 
@@ -126,3 +127,48 @@ def test_pixels_that_are_not_square_stay_so(model, fy):
     found, records = run_rounds(made, replace(true_model(made), cameras=(start,)))
     np.testing.assert_allclose(found.cameras[0].params[:2], (500.0, fy), rtol=0.01)
     assert records[-1].name == "last pass"
+
+
+def stretched(fy, layout="area", held=frozenset(), **changes):
+    """What rounds make of a camera of one focal length: it, the rounds' names and the largest rotation error."""
+    made = make_problem(
+        16, 800, layout, noise_px=0.1, camera=camera_of("OPENCV", 500.0, fy, (-0.05,)), seed=3
+    )
+    start = Camera("SIMPLE_RADIAL", 640, 480, (480.0, 320.0, 240.0, 0.0), "estimated")
+    settings = {"widen_lenses": True, "refine_principal_points": False} | changes
+    model = replace(true_model(made), cameras=(start,))
+    found, records = run_rounds(made, model, SolverSettings(constant_cameras=held), **settings)
+    relative = found.rotations[1:] @ found.rotations[:-1].transpose(0, 2, 1)
+    truth = made.rotations[1:] @ made.rotations[:-1].transpose(0, 2, 1)
+    errors_deg = np.degrees(angle_of(relative @ truth.transpose(0, 2, 1)))
+    return found.cameras[0], [record.name for record in records], float(errors_deg.max())
+
+
+@pytest.mark.parametrize("fy", [450.0, 600.0])
+def test_images_that_were_stretched_are_found_out(fy):
+    camera, names, error_deg = stretched(fy)
+    assert (camera.model, camera.source) == ("OPENCV", "estimated")
+    np.testing.assert_allclose(camera.params[:2], (500.0, fy), rtol=0.01)
+    assert "round 2 with wider lenses" in names
+    _, _, bent_deg = stretched(fy, widen_lenses=False)
+    assert error_deg < 0.1 < 0.5 < bent_deg
+
+
+@pytest.mark.parametrize(
+    "case",
+    [
+        {"fy": 500.0},
+        # calibrated lenses stay within it
+        {"fy": 505.0},
+        # cameras that stand upright do not tell the second
+        {"fy": 450.0, "layout": "ring"},
+        {"fy": 450.0, "held": frozenset([1])},
+        {"fy": 450.0, "widen_lenses": False},
+    ],
+    ids=["square", "hardly", "upright", "held", "switched off"],
+)
+def test_other_pixels_stay_square(case, monkeypatch):
+    monkeypatch.setitem(layouts.LAYOUTS, "ring", upright_ring)
+    camera, names, _ = stretched(**case)
+    assert camera.model == "SIMPLE_RADIAL"
+    assert not any("lenses" in name for name in names)

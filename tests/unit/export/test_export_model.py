@@ -219,6 +219,14 @@ def test_a_camera_that_was_reset_and_held_is_warned_of(tmp_path, problem, reset:
     assert all(line.startswith("camera 2 (SIMPLE_RADIAL): its distortion was") for line in found)
 
 
+@pytest.mark.parametrize(("spread", "told"), [(np.nan, 0), (0.083, 1)])
+def test_images_of_several_focal_lengths_are_warned_of(tmp_path, problem, spread: float, told: int) -> None:
+    summary = json.loads((export(tmp_path, problem, spread=spread) / "summary.json").read_text("utf-8"))
+    found = [line for line in summary["warnings"] if "differ in focal length by 8%" in line]
+    assert len(found) == told
+    assert all("camera 2 (" in line and "{camera_sharing: per_folder}" in line for line in found)
+
+
 @pytest.mark.parametrize(("offset", "told"), [(np.nan, 0), (0.0614, 1)])
 def test_a_far_principal_point_that_was_left_is_warned_of(
     tmp_path, problem, offset: float, told: int
@@ -229,6 +237,15 @@ def test_a_far_principal_point_that_was_left_is_warned_of(
     assert len(found) == told
     assert all(line.startswith("camera 2 (SIMPLE_RADIAL): its principal point") for line in found)
     assert all("lie 6.1% of the longer side away" in line for line in found)
+
+
+def test_a_camera_that_got_a_second_focal_length_is_warned_of() -> None:
+    stretched = Camera("OPENCV", 640, 480, (600.0, 450.0, 320.0, 240.0, 0.0, 0.0, 0.0, 0.0))
+    former = ["SIMPLE_RADIAL", "SIMPLE_RADIAL", "OPENCV"]
+    found = export_model._stretched_warnings({0: CAMERA, 1: stretched, 2: stretched}, former)
+    # what was given or chosen is known
+    assert [line.split(" (fx")[0] for line in found] == ["camera 2 (OPENCV): its pixels are not square"]
+    assert "fx / fy = 1.33" in found[0]
 
 
 @pytest.mark.parametrize(
@@ -259,7 +276,11 @@ def test_pictures_of_which_little_is_left_without_distortion_are_warned_of(
 def test_a_problem_of_many_cameras_is_told_of_some(monkeypatch, count: int, named: int) -> None:
     folding = Camera("SIMPLE_RADIAL", 640, 480, (300.0, 320.0, 240.0, -1.2))
     wide = Camera("FOV", 640, 480, (250.0, 250.0, 320.0, 240.0, 1.4))
-    adjusted = SimpleNamespace(camera_resets=["distortion"] * count, camera_offsets=np.full(count, 0.07))
+    adjusted = SimpleNamespace(
+        camera_resets=["distortion"] * count,
+        camera_offsets=np.full(count, 0.07),
+        camera_spreads=np.full(count, 0.1),
+    )
     one = SimpleNamespace(
         image_ids=np.zeros(1, int),
         points=np.ones((1, 3)),
@@ -272,9 +293,12 @@ def test_a_problem_of_many_cameras_is_told_of_some(monkeypatch, count: int, name
     monkeypatch.setattr(export_model, "fit_lenses", lambda *_: misfits)
     monkeypatch.setattr(export_model, "undistorted_share", lambda _: 0.1)
     told = {
-        ("not invertible", "reset and kept fixed", "max_principal_point_offset"): (
-            export_model._camera_warnings(adjusted, dict.fromkeys(range(count), folding))
-        ),
+        (
+            "not invertible",
+            "reset and kept fixed",
+            "max_principal_point_offset",
+            "differ in focal length",
+        ): (export_model._camera_warnings(adjusted, dict.fromkeys(range(count), folding))),
         ("does not describe the lens",): export_model._lens_warnings(
             one, [folding] * count, np.zeros(1, int), ()
         ),

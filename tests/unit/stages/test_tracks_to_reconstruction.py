@@ -25,6 +25,7 @@ from snakesfm.geometry.camera import cameras_to_columns
 from snakesfm.geometry.rotations import angle_of
 from snakesfm.stages import adjust_bundle, build_tracks, triangulate_tracks
 from snakesfm.stages.job import StageJob
+from snakesfm.stages.triangulate_tracks import LEAST_SHARE
 from snakesfm.synthetic.problems import make_problem, perturb_rotations
 
 COUNT = 12
@@ -222,8 +223,35 @@ def test_poses_that_fit_nothing_are_named(inputs):
     centers = CameraCenters.read(inputs["centers"])
     columns = dict(vars(centers)) | {"centers": np.full((COUNT, 3), np.nan)}
     CameraCenters(**columns).write(inputs["centers"], HEADER)
-    with pytest.raises(SceneError, match="none of"):
+    with pytest.raises(SceneError, match="0 of 0 tracks"):
         run(triangulate_tracks, TriangulateTracksOptions(), inputs, inputs["points"])
+
+
+@pytest.mark.parametrize("near", [0.01, 0.04])
+def test_photographs_from_one_position_are_refused_and_far_scenes_are_not(made, inputs, near):
+    """Cameras that all look one way at what is far beyond any depth, but for a share of the tracks."""
+    run(build_tracks, BuildTracksOptions(), inputs, inputs["tracks"])
+    tracks, averaged = TrackTable.read(inputs["tracks"]), CameraRotations.read(inputs["rotations"])
+    turned = np.isfinite(averaged.rotations[:, :1, :1])
+    replace(averaged, rotations=np.where(turned, np.eye(3), np.nan)).write(inputs["rotations"], HEADER)
+    lengths = np.diff(tracks.offsets)
+    random = np.random.default_rng(3)
+    extent = np.ptp(made.centers)
+    depths = np.where(np.arange(len(lengths)) < near * len(lengths), 3.0, 1e5) * extent
+    slopes = random.uniform(-0.2, 0.2, (len(lengths), 2))
+    points = np.column_stack([slopes, np.ones(len(lengths))]) * depths[:, None]
+    centers = CameraCenters.read(inputs["centers"]).centers[tracks.image_ids]
+    seen = np.nan_to_num(np.repeat(points, lengths, axis=0) - centers, nan=1.0)
+    focal, center = made.cameras[0].focal_px, made.cameras[0].params[-2:]
+    keypoints = focal * seen[:, :2] / seen[:, 2:] + center
+    replace(tracks, keypoints=keypoints.astype(np.float32)).write(inputs["tracks"], HEADER)
+    if near < LEAST_SHARE:
+        with pytest.raises(SceneError, match=r"'scene': \d of \d+ tracks .* all taken from one position"):
+            run(triangulate_tracks, TriangulateTracksOptions(), inputs, inputs["points"])
+    else:
+        run(triangulate_tracks, TriangulateTracksOptions(), inputs, inputs["points"])
+        found = len(TriangulatedPoints.read(inputs["points"]).points)
+        assert 0.5 * near * len(lengths) < found < 0.1 * len(lengths)
 
 
 def test_matches_of_refused_pairs_bring_observations_where_the_model_agrees(made, inputs, tmp_path):

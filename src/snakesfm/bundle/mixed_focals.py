@@ -1,0 +1,58 @@
+"""Cameras that images share though they were taken with several focal lengths."""
+
+import numpy as np
+
+from snakesfm.bundle.interface import BundleAdjuster, SolverSettings
+from snakesfm.bundle.principal_points import observation_errors, shared_cameras
+from snakesfm.bundle.reading import read_tracks_and_pixels
+from snakesfm.bundle.selection import with_points
+from snakesfm.geometry.camera import Camera
+from snakesfm.geometry.colmap_binding import pycolmap
+
+MAX_SPREAD = 0.02
+"""Of focal lengths of one camera, the ninth decile over the first, less one: focusing changes less."""
+NOISE_SHARE = 0.7
+"""Of the errors, what a camera for each image must leave at most: freedom alone takes a few per cent."""
+# each image must see enough of them to tell its own focal length, and more cost time
+POINTS_PER_IMAGE = 15
+LEAST_POINTS = 2500
+
+
+def find_mixed_focals(
+    reconstruction: pycolmap.Reconstruction, adjust: BundleAdjuster, solving: SolverSettings
+) -> dict[int, float]:
+    """Cameras by id whose images differ in focal length, and by how much, 0.1 for 10 %.
+
+    Some of the points are adjusted in a copy that has a camera for each image.
+
+    Parameters
+    ----------
+    reconstruction : an adjusted model; stays as it is.
+    adjust, solving : the solver; cameras that it holds, or of few images, are no candidates.
+    """
+    shared = shared_cameras(reconstruction, solving.constant_cameras)
+    if not shared:
+        return {}
+    tracks, pixels = read_tracks_and_pixels(reconstruction)
+    chosen = np.zeros(len(tracks.points), dtype=bool)
+    wanted = max(LEAST_POINTS, POINTS_PER_IMAGE * reconstruction.num_reg_images())
+    chosen[:: -(-len(chosen) // wanted) or 1] = True
+    before = with_points(reconstruction, tracks, pixels, chosen)
+    after = with_points(reconstruction, tracks, pixels, chosen, shared)
+    adjust(after, solving)
+    shared_of, errors_before = observation_errors(before)
+    own_of, errors_after = observation_errors(after)
+    found = {}
+    for camera_id in sorted(shared):
+        # observations are in one order in both
+        mine = shared_of == camera_id
+        if not mine.any():
+            continue
+        focals = [
+            Camera.of_pycolmap(after.camera(own)).focal_px for own in np.unique(own_of[mine]).tolist()
+        ]
+        low, high = np.quantile(focals, [0.1, 0.9])
+        share = np.median(errors_after[mine]) / max(np.median(errors_before[mine]), 1e-9)
+        if high > (1.0 + MAX_SPREAD) * low and share < NOISE_SHARE:
+            found[camera_id] = float(high / low - 1.0)
+    return found

@@ -1,0 +1,84 @@
+"""Focal lengths where every place was photographed several times."""
+
+from dataclasses import replace
+from itertools import combinations
+
+import numpy as np
+import pytest
+from synthetic_scene import HEADER, write_scene
+
+from snakesfm.artifacts import CalibratedCameras, PairMatches
+from snakesfm.config.calibrate_cameras import CalibrateCamerasOptions
+from snakesfm.stages import calibrate_cameras
+from snakesfm.stages.job import StageJob
+from snakesfm.synthetic.problems import make_problem
+
+PLACES, COPIES = 12, 5
+WRONG = 1.3
+
+
+def burst():
+    """A scene of which every image is there five times, with noise; copies match best."""
+    made = make_problem(PLACES, 600, "ring", noise_px=0.1, seed=7)
+    random = np.random.default_rng(1)
+    keypoints = [
+        points + (copy > 0) * random.normal(0.0, 0.1, points.shape)
+        for copy in range(COPIES)
+        for points in made.keypoints
+    ]
+    pairs, matches = made.pairs.tolist(), np.split(made.matches, made.match_offsets[1:-1])
+    for first, second in combinations(range(COPIES), 2):
+        for place, points in enumerate(made.keypoints):
+            pairs.append([first * PLACES + place, second * PLACES + place])
+            matches.append(np.repeat(np.arange(len(points)), 2).reshape(-1, 2))
+    order = sorted(range(len(pairs)), key=pairs.__getitem__)
+    edges = np.minimum(order, len(made.pairs) - 1)
+    lengths = [len(matches[row]) for row in order]
+    camera = made.cameras[0].with_focal(WRONG * made.cameras[0].focal_px, "default")
+    return made, replace(
+        made,
+        cameras=(camera,),
+        camera_ids=np.zeros(PLACES * COPIES, int),
+        rotations=np.tile(made.rotations, (COPIES, 1, 1)),
+        translations=np.tile(made.translations, (COPIES, 1)),
+        keypoints=keypoints,
+        pairs=np.array([pairs[row] for row in order]),
+        matches=np.concatenate([matches[row] for row in order]),
+        match_offsets=np.r_[0, np.cumsum(lengths)],
+        **{
+            name: getattr(made, name)[edges]
+            for name in (
+                "edge_rotations",
+                "edge_translations",
+                "edge_covariances",
+                "edge_inlier_counts",
+                "edge_angles_deg",
+            )
+        },
+    )
+
+
+@pytest.mark.parametrize(("moved_px", "source"), [(None, "estimated"), (0.0, "default")])
+def test_pairs_of_one_place_do_not_take_the_place_of_those_that_tell(
+    tmp_path, monkeypatch, moved_px, source
+):
+    if moved_px is not None:
+        monkeypatch.setattr(calibrate_cameras, "MOVED_PX", moved_px)
+    made, copies = burst()
+    inputs = write_scene(copies, tmp_path)
+    PairMatches(
+        copies.pairs.astype(np.int32),
+        np.full(len(copies.pairs), "", dtype=object),
+        copies.match_offsets,
+        copies.matches.astype(np.int32),
+        np.ones(len(copies.matches), np.float32),
+    ).write(tmp_path / "matches.h5", HEADER)
+    inputs = {name: inputs[name] for name in ("index", "features")} | {"matches": tmp_path / "matches.h5"}
+    job = StageJob(
+        "calibrate_cameras", "scene", inputs, (tmp_path / "out.h5",), CalibrateCamerasOptions(), threads=1
+    )
+    calibrate_cameras.run(job)
+    found = CalibratedCameras.read(job.output)
+    assert found.sources.tolist() == [source]
+    expected = 1.0 if source == "estimated" else WRONG
+    assert found.params[0, 0] / made.cameras[0].focal_px == pytest.approx(expected, rel=0.02)
