@@ -52,7 +52,7 @@ from snakesfm.errors import ConfigError
             ["key 'adjust_bundle': refine_finenesses must increase"],
         ),
         ({"adjust_bundle": {"thresholds_px": [5, 0]}}, ["thresholds_px' = 0: ", "greater than 0."]),
-        ({"adjust_bundle": {"early_loss_share": 0}}, ["early_loss_share' = 0: ", "greater than 0."]),
+        ({"adjust_bundle": {"early_loss_share": 0}}, ["early_loss_share' = 0: ", "equal to 0.001."]),
         ({"evaluate_model": {"relative_thresholds_deg": [0, 1]}}, ["_deg' = 0: ", "greater than 0."]),
         ({"evaluate_model": {"global_thresholds_deg": [1, 181]}}, ["_deg' = 181: ", "equal to 180."]),
         ({"adjust_bundle": {"max_iterations": 2**31}}, ["max_iterations' = 2147483648: ", "1000000"]),

@@ -1,5 +1,7 @@
 """Cameras that images share though they were taken with several focal lengths."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from snakesfm.bundle.interface import BundleAdjuster, SolverSettings
@@ -12,7 +14,7 @@ from snakesfm.geometry.colmap_binding import pycolmap
 MAX_SPREAD = 0.02
 """Of focal lengths of one camera, the ninth decile over the first, less one: focusing changes less."""
 NOISE_SHARE = 0.7
-"""Of the errors, what a camera for each image must leave at most: freedom alone takes a few per cent."""
+"""Of the errors, what a focal length for each image must leave at most: freedom alone takes little."""
 # each image must see enough of them to tell its own focal length, and more cost time
 POINTS_PER_IMAGE = 15
 LEAST_POINTS = 2500
@@ -23,7 +25,8 @@ def find_mixed_focals(
 ) -> dict[int, float]:
     """Cameras by id whose images differ in focal length, and by how much, 0.1 for 10 %.
 
-    Some of the points are adjusted in a copy that has a camera for each image.
+    Some of the points are adjusted twice, with one focal length and with one for each image; distortion is
+    held, so that few points do not determine much.
 
     Parameters
     ----------
@@ -31,15 +34,17 @@ def find_mixed_focals(
     adjust, solving : the solver; cameras that it holds, or of few images, are no candidates.
     """
     shared = shared_cameras(reconstruction, solving.constant_cameras)
-    if not shared:
+    if not shared or not solving.refine_focal:
         return {}
+    solving = replace(solving, refine_distortion=False)
     tracks, pixels = read_tracks_and_pixels(reconstruction)
     chosen = np.zeros(len(tracks.points), dtype=bool)
     wanted = max(LEAST_POINTS, POINTS_PER_IMAGE * reconstruction.num_reg_images())
     chosen[:: -(-len(chosen) // wanted) or 1] = True
     before = with_points(reconstruction, tracks, pixels, chosen)
     after = with_points(reconstruction, tracks, pixels, chosen, shared)
-    adjust(after, solving)
+    for trial in (before, after):
+        adjust(trial, solving)
     shared_of, errors_before = observation_errors(before)
     own_of, errors_after = observation_errors(after)
     found = {}

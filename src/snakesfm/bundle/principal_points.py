@@ -132,14 +132,17 @@ def _adjusted_half(
 
 
 def observation_errors(reconstruction: pycolmap.Reconstruction) -> tuple[Array, Array]:
-    """Id of the camera (L,) int64 of each observation, and its reprojection error (L,) in pixels."""
+    """Id of the camera (L,) int64 of each observation, and its reprojection error (L,) in pixels.
+
+    It is infinite where the camera does not see the point, as of one that came to lie behind it.
+    """
     tracks, pixels = read_tracks_and_pixels(reconstruction)
     camera_of, in_camera = points_in_cameras(reconstruction, tracks)
     errors = np.zeros(len(camera_of))
     for camera_id, mine in rows_of_each(camera_of):
         seen = reconstruction.camera(camera_id).img_from_cam(in_camera[mine])
         errors[mine] = np.linalg.norm(seen - pixels[mine], axis=1)
-    return camera_of, errors
+    return camera_of, np.where(np.isnan(errors), np.inf, errors)
 
 
 def _median_errors(reconstruction: pycolmap.Reconstruction) -> dict[int, float]:

@@ -33,7 +33,7 @@ class AdjustBundleOptions(StageOptions):
     """Loss scale that loss_scale_px 'auto' uses, in standard deviations of the keypoint noise; 2.4 is
     better without keypoint refinement."""
 
-    early_loss_share: float = Field(default=0.4, gt=0.0, le=10.0)
+    early_loss_share: float = Field(default=0.4, ge=1e-3, le=10.0)
     """Loss scale of the earlier rounds as a fraction of the round's threshold; wide, because the start
     is poor."""
 

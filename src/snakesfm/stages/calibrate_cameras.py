@@ -36,8 +36,6 @@ LEAST_IMAGES = 5
 # matches of images taken from one place, as of bursts and slow video, move less in the median: such pairs
 # match best and tell no focal length
 MOVED_PX = 3.0
-# how often others are chosen instead of such pairs
-MOST_CHOICES = 100
 # more pairs show no other overlay, and cost time
 OVERLAY_PAIRS = 3000
 OVERLAY = (
@@ -93,14 +91,19 @@ def _calibrate(
     options: CalibrateCamerasOptions = job.options
     given = np.array([camera.source == "given" for camera in cameras], dtype=bool)
     counts = matched.counts.copy()
-    for _ in range(MOST_CHOICES):
-        chosen = choose_pairs(
-            matched.pairs, counts, index.camera_ids, ~given, options.pairs_per_camera, options.min_matches
+
+    def choose(per_camera: int) -> Array:
+        return choose_pairs(
+            matched.pairs, counts, index.camera_ids, ~given, per_camera, options.min_matches
         )
-        still = matched.still_pairs(chosen, MOVED_PX)
-        if not len(still):
-            break
+
+    chosen, looked_at = choose(options.pairs_per_camera), options.pairs_per_camera
+    while len(still := matched.still_pairs(chosen, MOVED_PX)):
         counts[still] = 0
+        # where most pairs are such, their number is that of the images
+        looked_at *= 2
+        counts[matched.still_pairs(choose(looked_at), MOVED_PX)] = 0
+        chosen = choose(options.pairs_per_camera)
     progress = job.progress(len(chosen), "pairs")
     pairs: dict[int, MatchedPair] = {}
     for row, first, second in matched.read(chosen):
