@@ -13,21 +13,21 @@ from snakesfm.stages import calibrate_cameras
 from snakesfm.stages.job import StageJob
 from snakesfm.synthetic.problems import make_problem
 
-PLACES, COPIES = 12, 5
+PLACES = 12
 WRONG = 1.3
 
 
-def burst():
-    """A scene of which every image is there five times, with noise; copies match best."""
+def burst(copies):
+    """A scene of which every image is there several times, with noise; copies match best."""
     made = make_problem(PLACES, 600, "ring", noise_px=0.1, seed=7)
     random = np.random.default_rng(1)
     keypoints = [
         points + (copy > 0) * random.normal(0.0, 0.1, points.shape)
-        for copy in range(COPIES)
+        for copy in range(copies)
         for points in made.keypoints
     ]
     pairs, matches = made.pairs.tolist(), np.split(made.matches, made.match_offsets[1:-1])
-    for first, second in combinations(range(COPIES), 2):
+    for first, second in combinations(range(copies), 2):
         for place, points in enumerate(made.keypoints):
             pairs.append([first * PLACES + place, second * PLACES + place])
             matches.append(np.repeat(np.arange(len(points)), 2).reshape(-1, 2))
@@ -38,9 +38,9 @@ def burst():
     return made, replace(
         made,
         cameras=(camera,),
-        camera_ids=np.zeros(PLACES * COPIES, int),
-        rotations=np.tile(made.rotations, (COPIES, 1, 1)),
-        translations=np.tile(made.translations, (COPIES, 1)),
+        camera_ids=np.zeros(PLACES * copies, int),
+        rotations=np.tile(made.rotations, (copies, 1, 1)),
+        translations=np.tile(made.translations, (copies, 1)),
         keypoints=keypoints,
         pairs=np.array([pairs[row] for row in order]),
         matches=np.concatenate([matches[row] for row in order]),
@@ -58,13 +58,15 @@ def burst():
     )
 
 
-@pytest.mark.parametrize(("moved_px", "source"), [(None, "estimated"), (0.0, "default")])
+@pytest.mark.parametrize(
+    ("count", "moved_px", "source"), [(5, None, "estimated"), (5, 0.0, "default"), (26, None, "estimated")]
+)
 def test_pairs_of_one_place_do_not_take_the_place_of_those_that_tell(
-    tmp_path, monkeypatch, moved_px, source
+    tmp_path, monkeypatch, count, moved_px, source
 ):
     if moved_px is not None:
         monkeypatch.setattr(calibrate_cameras, "MOVED_PX", moved_px)
-    made, copies = burst()
+    made, copies = burst(count)
     inputs = write_scene(copies, tmp_path)
     PairMatches(
         copies.pairs.astype(np.int32),
