@@ -102,7 +102,10 @@ def _pixels(path: Path, tracks: Tracks) -> Array:
     with path.open("rb") as file:
         for _ in range(COUNT.unpack(file.read(COUNT.size))[0]):
             image_id, _, count = read_image_head(file)
-            keypoints = np.frombuffer(file.read(count * KEYPOINT.itemsize), KEYPOINT)["xy"]
+            content = file.read(count * KEYPOINT.itemsize)
+            if len(content) < count * KEYPOINT.itemsize:
+                raise struct.error(f"{path.name} ends within the keypoints of an image")
+            keypoints = np.frombuffer(content, KEYPOINT)["xy"]
             mine = of_image.get(image_id - 1, slice(0))
             pixels[mine] = keypoints[tracks.rows[mine]]
     return pixels

@@ -1,6 +1,7 @@
 """What is read from pycolmap's files is what its objects say."""
 
 import errno
+import math
 import tempfile
 from pathlib import Path
 
@@ -80,23 +81,33 @@ def test_an_empty_model_has_none():
 
 
 class OnAFullDisk:
-    """A model of which pycolmap writes the points no farther than the disk has room."""
+    """A model of which pycolmap writes one file no farther than the disk has room: all but so many bytes."""
 
-    def __init__(self, room: float) -> None:
-        self.model, self.room = reconstruction_with_gaps(), room
+    def __init__(self, name: str, lacking: float) -> None:
+        self.model, self.name, self.lacking = reconstruction_with_gaps(), name, lacking
 
     def write_binary(self, folder: str) -> None:
         self.model.write_binary(folder)
-        path = Path(folder) / "points3D.bin"
+        path = Path(folder) / self.name
         content = path.read_bytes()
-        path.write_bytes(content[: int(self.room * len(content))])
+        # a share of the file below 1, bytes above
+        lacking = self.lacking if self.lacking >= 1 else math.ceil(self.lacking * len(content))
+        assert 0 < lacking < len(content)
+        path.write_bytes(content[: len(content) - int(lacking)])
 
 
-@pytest.mark.parametrize("room", [0.0, 0.001, 0.3, 0.5, 0.999])
-def test_a_full_disk_for_temporary_files_is_named(room, tmp_path, monkeypatch):
+CUT = [
+    *(("points3D.bin", lacking) for lacking in (0.001, 0.5, 0.7, 0.999)),
+    # the last byte, the last keypoint, and all of the last image and more
+    *(("images.bin", lacking) for lacking in (1, 24, 2400, 0.999)),
+]
+
+
+@pytest.mark.parametrize(("name", "lacking"), CUT)
+def test_a_full_disk_for_temporary_files_is_named(name, lacking, tmp_path, monkeypatch):
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     with pytest.raises(OSError, match="No space left") as error:
-        read_tracks(OnAFullDisk(room))
+        read_tracks_and_pixels(OnAFullDisk(name, lacking))
     assert (error.value.errno, error.value.filename) == (errno.ENOSPC, str(tmp_path))
     assert not list(tmp_path.iterdir())
 
