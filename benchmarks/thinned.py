@@ -14,6 +14,7 @@ from pathlib import Path
 from benchmarks.compare.sets import ImageSet, read_sets
 from snakesfm.errors import SnakesfmError
 from snakesfm.evaluation.colmap_model import read_model
+from snakesfm.geometry.colmap_checks import check_binary
 
 
 def thin(images: ImageSet, every: int, target: Path) -> int:
@@ -30,6 +31,7 @@ def thin(images: ImageSet, every: int, target: Path) -> int:
         place.symlink_to((images.images / name).resolve())
     (target / "reference").mkdir(exist_ok=True)
     model.write_binary(str(target / "reference"))
+    check_binary(target / "reference", model)
     meta = images.folder / "meta.yaml"
     if meta.is_file():
         (target / "meta.yaml").write_bytes(meta.read_bytes())

@@ -24,6 +24,7 @@ from snakesfm.config.configuration import options_class
 from snakesfm.config.select_pairs import SelectPairsOptions
 from snakesfm.errors import ConfigError, SnakesfmError
 from snakesfm.geometry.camera import Camera, cameras_to_columns
+from snakesfm.geometry.colmap_checks import check_binary
 from snakesfm.geometry.poses import translation_of
 from snakesfm.grouping import offsets_of
 from snakesfm.seeding import derive_seed
@@ -103,6 +104,7 @@ class Simulation:
         )
         (self.folder / "reference").mkdir()
         model.write_binary(str(self.folder / "reference"))
+        check_binary(self.folder / "reference", model)
 
     @property
     def camera(self) -> Camera:

@@ -37,14 +37,15 @@ def check_binary(folder: Path, model: pycolmap.Reconstruction, parameters: int |
     ------
     OSError : the disk is full.
     """
-    images = model.images.values()
+    # COLMAP writes images and frames that have a pose, but all cameras and rigs
+    images = [model.image(key) for key in model.reg_image_ids()]
     counts = [parameters or len(camera.params) for camera in model.cameras.values()]
     # of an image its name, the zero at the name's end, and the number of its keypoints
     heads = sum(IMAGE.size + len(os.fsencode(image.name)) + 1 + COUNT.size for image in images)
     sizes = {
         "cameras.bin": CAMERA_BYTES * len(counts) + PARAMETER_BYTES * sum(counts),
         "rigs.bin": RIG_BYTES * model.num_rigs(),
-        "frames.bin": FRAME_BYTES * model.num_frames(),
+        "frames.bin": FRAME_BYTES * model.num_reg_frames(),
         IMAGES_FILE: heads + KEYPOINT.itemsize * sum(image.num_points2D() for image in images),
         POINTS_FILE: POINT.itemsize * model.num_points3D()
         + ELEMENT.itemsize * model.compute_num_observations(),
@@ -64,8 +65,8 @@ def check_text(folder: Path, model: pycolmap.Reconstruction) -> None:
     lines = {
         "cameras.txt": model.num_cameras(),
         "rigs.txt": model.num_rigs(),
-        "frames.txt": model.num_frames(),
-        "images.txt": 2 * model.num_images(),
+        "frames.txt": model.num_reg_frames(),
+        "images.txt": 2 * model.num_reg_images(),
         "points3D.txt": model.num_points3D(),
     }
     for name, count in lines.items():

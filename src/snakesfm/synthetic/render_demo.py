@@ -20,6 +20,7 @@ from snakesfm.arrays import Array
 from snakesfm.errors import ConfigError, SnakesfmError
 from snakesfm.export.colmap import build_reconstruction
 from snakesfm.geometry.camera import Camera
+from snakesfm.geometry.colmap_checks import check_text
 from snakesfm.seeding import derive_seed
 from snakesfm.synthetic.raster import Face, View, render
 from snakesfm.synthetic.scene import DemoOptions, build_scene, camera_path, sample_points, sky
@@ -172,6 +173,7 @@ def _write_reference(
         pixels[kept][point_ids, image_ids],
     )
     model.write_text(str(folder))
+    check_text(folder, model)
 
 
 def main(arguments: list[str] | None = None) -> int:

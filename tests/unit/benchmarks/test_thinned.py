@@ -1,7 +1,9 @@
 """Thinned image sets: which images, and a reference of these alone."""
 
 import shutil
+from pathlib import Path
 
+import pycolmap
 import pytest
 
 from benchmarks.compare.sets import read_sets
@@ -35,6 +37,19 @@ def test_every_second_image_that_the_reference_has(data, tmp_path) -> None:
     # a second run changes nothing
     assert main([str(data), str(tmp_path), "--every", "2", "--least", "3"]) == 0
     assert read_sets(tmp_path, [])[0].image_names() == thinned.image_names()
+
+
+def test_a_reference_that_the_disk_has_no_room_for_is_no_success(data, tmp_path, monkeypatch) -> None:
+    write = pycolmap.Reconstruction.write_binary
+
+    def write_in_vain(model: pycolmap.Reconstruction, folder: str) -> None:
+        write(model, folder)
+        cut = Path(folder) / "images.bin"
+        cut.write_bytes(cut.read_bytes()[:-1])
+
+    monkeypatch.setattr(pycolmap.Reconstruction, "write_binary", write_in_vain)
+    with pytest.raises(OSError, match="No space left"):
+        main([str(data), str(tmp_path), "--every", "2", "--least", "3"])
 
 
 def test_what_is_no_set_is_said(tmp_path, capsys) -> None:

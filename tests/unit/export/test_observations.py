@@ -110,9 +110,13 @@ def files_of(model: pycolmap.Reconstruction, folder: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in folder.iterdir()}
 
 
+@pytest.mark.parametrize("deregistered", [False, True])
 @pytest.mark.parametrize("number", [0, 1])
-def test_every_file_that_lacks_its_last_byte_is_found(tmp_path, number) -> None:
+def test_every_file_that_lacks_its_last_byte_is_found(tmp_path, number, deregistered) -> None:
     model = build_reconstruction(*list(parts())[number])
+    if deregistered:
+        model.deregister_frame(max(model.reg_frame_ids()))
+        assert model.num_reg_images() < model.num_images()
 
     def check() -> None:
         check_binary(tmp_path / "model", model)

@@ -4,6 +4,7 @@ import tracemalloc
 from pathlib import Path
 
 import numpy as np
+import pycolmap
 import pytest
 
 from snakesfm.artifacts.features import LocalFeatures
@@ -223,6 +224,21 @@ def test_memory_does_not_grow_with_the_number_of_blocks(tmp_path: Path) -> None:
         tracemalloc.stop()
     # per image of the largest block; cells that are kept for reuse may add a little
     assert 0.6 < peaks[1] / peaks[0] < 1.4
+
+
+def test_a_reference_that_the_disk_has_no_room_for_is_no_success(tmp_path: Path, monkeypatch) -> None:
+    write = pycolmap.Reconstruction.write_binary
+
+    def write_in_vain(model: pycolmap.Reconstruction, folder: str) -> None:
+        write(model, folder)
+        # temporary files are whole
+        if Path(folder).name == "reference":
+            cut = Path(folder) / "images.bin"
+            cut.write_bytes(cut.read_bytes()[:-1])
+
+    monkeypatch.setattr(pycolmap.Reconstruction, "write_binary", write_in_vain)
+    with pytest.raises(OSError, match="No space left"):
+        main([str(tmp_path / "new"), "--images", "10"])
 
 
 def test_a_folder_in_use_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
