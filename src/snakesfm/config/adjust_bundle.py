@@ -139,8 +139,8 @@ class AdjustBundleOptions(StageOptions):
     images, from the longest tracks; 0 uses all."""
 
     final_observations: int = Field(default=0, ge=0)
-    """Observations per image used in the last pass of models with more than select_above_images images;
-    0 uses all. 1000 takes less memory and costs a little accuracy."""
+    """Observations per image used in the last pass alone of models with more than select_above_images
+    images, which takes the most memory; 0 uses all. 1000 takes less memory and costs a little accuracy."""
 
     max_iterations: Annotated[int, Field(ge=1, le=1_000_000)] | Literal["auto"] = "auto"
     """Solver iterations per pass; 'auto' is 50, up to 500 in small models, where they are cheap."""
