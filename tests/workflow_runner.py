@@ -14,6 +14,8 @@ from pathlib import Path
 
 from snakemake_forks import call_snakemake
 
+from snakesfm.job import THREAD_VARIABLES
+
 ROOT = Path(__file__).resolve().parents[1]
 
 
@@ -57,12 +59,20 @@ class Workflow:
             common += ["--cores", str(cores)]
         return [*common, *arguments]
 
+    def _user_environment(self) -> dict[str, str]:
+        """The environment without the limits of the tests' own threads: jobs limit theirs themselves."""
+        environment = os.environ if self.environment is None else self.environment
+        return {name: value for name, value in environment.items() if name not in THREAD_VARIABLES}
+
     def run(self, *arguments: str, cores: int = 2, timeout: float = 300) -> Outcome:
         """Run to the end, without the time that the command takes to load Snakemake."""
-        environment = os.environ if self.environment is None else self.environment
         with tempfile.NamedTemporaryFile() as log:
             status = call_snakemake(
-                self._arguments(*arguments, cores=cores), self.folder, environment, Path(log.name), timeout
+                self._arguments(*arguments, cores=cores),
+                self.folder,
+                self._user_environment(),
+                Path(log.name),
+                timeout,
             )
             return Outcome(status, Path(log.name).read_text("utf-8"))
 
@@ -71,7 +81,7 @@ class Workflow:
         return subprocess.Popen(
             self.command(*arguments, cores=cores),
             cwd=self.folder,
-            env=self.environment,
+            env=self._user_environment(),
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
             text=True,
@@ -87,6 +97,7 @@ class Workflow:
         with subprocess.Popen(
             self.command(*arguments),
             cwd=self.folder,
+            env=self._user_environment(),
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
             start_new_session=True,

@@ -18,6 +18,7 @@ MAKES_NOTHING = re.compile(
     r"d3dag|cleanup-.*|delete-.*|containerize|generate-unit-tests|export-cwl|print-compilation)(=.*)?"
 )
 DELETES = re.compile(r"--delete-.*")
+PRETENDS = re.compile(rf"-[{FLAGS}]*n.*|--dry-?run")
 # it does not make all of its targets, or keeps no records
 MAKES_PART = frozenset(("--until", "-U", "--omit-from", "-O", "--drop-metadata"))
 # an option that names rules, the first of them in the same word
@@ -141,8 +142,9 @@ def makes_nothing(arguments: Iterable[str]) -> bool:
 
 
 def deletes(arguments: Iterable[str]) -> bool:
-    """Whether Snakemake is asked to delete results, by these arguments of its command line."""
-    return any(DELETES.fullmatch(argument) for argument in arguments)
+    """Whether Snakemake is asked to delete results, and not only to say which, by these arguments."""
+    given = list(arguments)
+    return any(map(DELETES.fullmatch, given)) and not any(map(PRETENDS.fullmatch, given))
 
 
 def _record_name(output: str) -> str:

@@ -70,6 +70,11 @@ def server_of(parent: Command) -> int:
     return server
 
 
+def test_libraries_that_the_server_has_loaded_start_no_threads(address: str, parent: Command) -> None:
+    tasks = Path(f"/proc/{server_of(parent)}/task")
+    assert len(list(tasks.iterdir())) == 1
+
+
 @pytest.fixture
 def ask(address: str) -> Iterator[Callable[[str], Command]]:
     """Starts a job's command that has the server run a stage."""

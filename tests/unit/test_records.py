@@ -119,7 +119,19 @@ def test_what_makes_nothing_is_told_by_its_arguments(arguments: list[str], nothi
 
 @pytest.mark.parametrize(
     ("arguments", "some"),
-    [(["--delete-all-output", "-n"], True), (["--delete-temp-output"], True), (["--touch", "all"], False)],
+    [
+        (["--delete-all-output", "--cores", "1"], True),
+        (["--delete-temp-output"], True),
+        # -s takes the rest of its word, and unlocking pretends nothing
+        (["--delete-all-output", "-sn"], True),
+        (["--unlock", "--delete-all-output", "-k"], True),
+        (["--delete-all-output", "-n"], False),
+        (["-pn", "--delete-all-output"], False),
+        (["--dry-run", "--delete-temp-output"], False),
+        (["--delete-all-output", "--dryrun"], False),
+        (["--touch", "all"], False),
+        (["-n"], False),
+    ],
 )
 def test_what_deletes_is_told_by_its_arguments(arguments: list[str], some: bool) -> None:
     assert deletes(arguments) == some

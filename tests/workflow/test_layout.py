@@ -6,6 +6,7 @@ from graphlib import TopologicalSorter
 from pathlib import Path
 
 import pytest
+from workflow_runner import Workflow
 
 from snakesfm.config.configuration import configuration_class, options_class
 from snakesfm.pipeline import STAGES
@@ -167,3 +168,21 @@ def test_no_source_file_is_too_long(root: Path) -> None:
         if (count := len(file.read_text().splitlines())) > 450
     }
     assert not long
+
+
+def test_runs_get_no_limit_of_threads_from_the_tests(workflow: Workflow) -> None:
+    snakefile = workflow.folder / "Snakefile"
+    snakefile.write_text(
+        "import os\n"
+        "print('limits:', *(name for name in os.environ if name.endswith('_NUM_THREADS')), file=open('told', 'a'))\n"
+        "while 'wait' in config:\n    pass\n"
+    )
+    told = workflow.folder / "told"
+    workflow.run("--snakefile", str(snakefile), "-n")
+    with workflow.start("--snakefile", str(snakefile), "-n") as run:
+        run.communicate(timeout=60)
+    written = told.read_text()
+    workflow.kill_when(
+        lambda: told.read_text() != written, "--snakefile", str(snakefile), "-n", "--config", "wait=1"
+    )
+    assert told.read_text() == "limits:\n" * 3

@@ -295,11 +295,14 @@ def test_two_runs_at_once_on_one_output_are_refused(finished, small_scene: Path,
         fcntl.flock(lock, fcntl.LOCK_EX)
         outcome = workflow.run(*config_of(small_scene))
         deleted = workflow.run("--delete-all-output", *config_of(small_scene))
+        pretended = workflow.run("--delete-all-output", "-n", *config_of(small_scene))
     for refused in (outcome, deleted):
         assert refused.status != 0
         assert "Another run (process 1 on elsewhere)" in refused.text
         assert "Traceback" not in refused.text
         assert refused.rules == []
+    # what deletes nothing is no harm beside a run
+    assert pretended.status == 0, pretended.text
     model = workflow.folder / "out" / "square" / "export_model" / "sparse" / "0" / "points3D.bin"
     assert model.is_file()
     alone = workflow.run("--delete-all-output", *config_of(small_scene))

@@ -12,8 +12,10 @@ from snakesfm.geometry.poses import center_of
 
 MAP_PX = 560
 MARGIN = 0.05
-# of the middle of all centres, so much more is shown on either side where there are any
-REACH = 1.0
+# times the distance from the middle within which nine tenths of the cameras lie; real sets need 2.3
+REACH = 3.0
+# of fewer cameras none counts as far away: of three along a street one often is thrice as far as the next
+LEAST_JUDGED = 6
 MARK_PX = 11.0
 # more cameras have smaller marks, which would else hide the points
 FULL_SIZE_MARKS = 50
@@ -81,10 +83,13 @@ def map_box(centers: Array, points: Array) -> tuple[Array, Array]:
     ----------
     centers, points : (n,k) and (T,k) along the map's axes, n >= 1.
     """
-    low, high = np.percentile(centers, [5, 95], axis=0)
-    reach = REACH * float((high - low).max())
-    low = np.maximum(centers.min(axis=0), low - reach)
-    high = np.minimum(centers.max(axis=0), high + reach)
+    low, high = centers.min(axis=0), centers.max(axis=0)
+    if len(centers) >= LEAST_JUDGED:
+        middle = np.median(centers, axis=0)
+        distances = np.linalg.norm(centers - middle, axis=1)
+        # a value of the set: one between two would follow the farthest camera of a few
+        reach = REACH * float(np.quantile(distances, 0.9, method="lower"))
+        low, high = np.maximum(low, middle - reach), np.minimum(high, middle + reach)
     if len(points):
         low = np.minimum(low, np.percentile(points, 2, axis=0))
         high = np.maximum(high, np.percentile(points, 98, axis=0))
@@ -112,7 +117,6 @@ def scene_map(
     centers = center_of(rotations, translations) @ axes.T
     places = points @ axes.T
     low, high = map_box(centers[:, :2], places[:, :2])
-    outside = int(np.count_nonzero(((centers[:, :2] < low) | (centers[:, :2] > high)).any(axis=1)))
     extent = max(float((high - low).max()), 1e-9)
     low, high = low - MARGIN * extent, high + MARGIN * extent
     scale = MAP_PX / float((high - low).max())
@@ -122,11 +126,13 @@ def scene_map(
         return np.column_stack([(xy[:, 0] - low[0]) * scale, height - (xy[:, 1] - low[1]) * scale])
 
     picture = _point_picture(pixels(places), places[:, 2], colors, (width, height))
+    spots = pixels(centers)
+    outside = int(np.count_nonzero(((spots < 0) | (spots > (width, height))).any(axis=1)))
     forward = rotations[:, 2] @ axes.T
     long = MARK_PX * min(1.0, (FULL_SIZE_MARKS / len(names)) ** 0.25)
     mark = f"M0 0L{long:.1f} {-long / 2.2:.1f}V{long / 2.2:.1f}Z"
     marks = []
-    for name, place, look in zip(names, pixels(centers), forward, strict=True):
+    for name, place, look in zip(names, spots, forward, strict=True):
         angle = np.degrees(np.arctan2(-look[1], look[0]))
         marks.append(
             f'<path d="{mark}" transform="translate({place[0]:.1f} {place[1]:.1f}) '

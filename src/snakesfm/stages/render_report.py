@@ -202,8 +202,8 @@ def _maps(names: Sequence[str], model: Reconstruction, registered: Array) -> lis
     maps = []
     for caption, view in views.items():
         picture, outside = scene_map(*content, view)
-        far = f"; {outside:,} cameras are too far away to be shown" if outside else ""
-        maps.append((caption + far, picture))
+        far = "1 camera is" if outside == 1 else f"{outside:,} cameras are"
+        maps.append((f"{caption}; {far} too far away to be shown" if outside else caption, picture))
     return maps
 
 

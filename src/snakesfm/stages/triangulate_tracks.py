@@ -27,7 +27,7 @@ def run(job: StageJob) -> None:
 
     Raises
     ------
-    SceneError : next to no track gives a point.
+    SceneError : next to no track gives a point, or no two images with a pose share one.
     """
     options: TriangulateTracksOptions = job.options
     index = ImageIndex.read(job.path("index"))
@@ -58,6 +58,12 @@ def run(job: StageJob) -> None:
     good = np.isfinite(points[:, 0])
     posed = has_pose(rotations, translations)[tracks.image_ids]
     seen_twice = int(np.count_nonzero(np.add.reduceat(posed, tracks.offsets[:-1], dtype=np.int64) > 1))
+    if seen_twice == 0:
+        raise SceneError(
+            f"Scene '{job.scene}': none of the {count} tracks is seen by two images with a position: see in"
+            " the logs of average_rotations and average_translations how many images they placed, add some"
+            " with more overlap, or try another average_translations.method."
+        )
     if good.sum() <= LEAST_SHARE * seen_twice:
         raise SceneError(
             f"Scene '{job.scene}': {good.sum()} of {seen_twice} tracks can be triangulated with averaged"

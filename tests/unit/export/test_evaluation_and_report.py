@@ -8,6 +8,7 @@ import pytest
 from finished_model import COUNT, LOST, NAMES, evaluate, export, report
 
 from snakesfm.pipeline import STAGES
+from snakesfm.stages import render_report
 
 
 def test_evaluation_against_the_exported_truth(tmp_path, problem) -> None:
@@ -50,6 +51,18 @@ def test_report_says_what_happened_and_escapes_names(tmp_path, problem) -> None:
     assert page.count("<title>") >= 2 * 8
     assert "http" not in page.replace("http-equiv", "")
     assert len(page) < 1_000_000
+
+
+@pytest.mark.parametrize(
+    ("outside", "told"), [(0, []), (1, ["1 camera is"]), (1234, ["1,234 cameras are"])]
+)
+def test_report_says_how_many_cameras_its_maps_leave_out(
+    tmp_path, problem, monkeypatch: pytest.MonkeyPatch, outside: int, told: list[str]
+) -> None:
+    monkeypatch.setattr(render_report, "scene_map", lambda *_: ("", outside))
+    page = report(tmp_path, problem, "")
+    assert re.findall(r"From above; (.*?) too far away to be shown", page) == told
+    assert "From the side" in page
 
 
 def test_report_without_reference_shows_at_most_the_asked_rows(tmp_path, problem) -> None:

@@ -113,7 +113,11 @@ def test_an_image_of_another_size_than_its_camera_is_named(tmp_path) -> None:
 
 
 @pytest.mark.parametrize(
-    "file", ["images/a.jpg", *(f"sparse/{part}.bin" for part in ("cameras", "images", "rigs", "frames"))]
+    "file",
+    [
+        "images/a.jpg",
+        *(f"sparse/{part}.bin" for part in ("cameras", "images", "rigs", "frames", "points3D")),
+    ],
 )
 def test_files_that_colmap_has_no_room_for_are_found(
     tmp_path, monkeypatch: pytest.MonkeyPatch, file: str
