@@ -10,13 +10,10 @@ focal length.
 from collections.abc import Collection, Sequence
 from dataclasses import replace
 
-import numpy as np
-
 from snakesfm.bundle.interface import BundleAdjuster, SolverSettings
 from snakesfm.bundle.lenses import set_camera
 from snakesfm.bundle.principal_points import shared_cameras
-from snakesfm.bundle.reading import read_tracks_and_pixels
-from snakesfm.bundle.selection import with_points
+from snakesfm.bundle.selection import with_some_points
 from snakesfm.geometry.camera import Camera
 from snakesfm.geometry.colmap_binding import pycolmap
 
@@ -59,10 +56,7 @@ def find_stretched_cameras(
     starts = {k: camera for k, camera in starts.items() if camera.model in STRETCHED_MODELS}
     if not starts:
         return {}
-    tracks, pixels = read_tracks_and_pixels(reconstruction)
-    chosen = np.zeros(len(tracks.points), dtype=bool)
-    chosen[:: -(-len(chosen) // MAX_POINTS) or 1] = True
-    trial = with_points(reconstruction, tracks, pixels, chosen)
+    trial = with_some_points(reconstruction, MAX_POINTS)
     for camera_id, camera in starts.items():
         set_camera(trial, camera_id, with_two_focals(camera, STRETCHED_MODELS[camera.model]))
     adjust(trial, solving)

@@ -7,7 +7,7 @@ import numpy as np
 from snakesfm.bundle.interface import BundleAdjuster, SolverSettings
 from snakesfm.bundle.principal_points import shared_cameras
 from snakesfm.bundle.reading import points_in_cameras, read_tracks_and_pixels
-from snakesfm.bundle.selection import with_points
+from snakesfm.bundle.selection import with_some_points
 from snakesfm.geometry.camera import Camera
 from snakesfm.geometry.colmap_binding import pycolmap
 from snakesfm.geometry.lens_fit import MAX_MISFIT, LensFit, fit_lenses
@@ -37,10 +37,7 @@ def find_wider_lenses(
     doubtful = [camera_id for camera_id, fit in before.items() if fit.misfit > MAX_MISFIT]
     if not doubtful:
         return {}
-    tracks, pixels = read_tracks_and_pixels(reconstruction)
-    chosen = np.zeros(len(tracks.points), dtype=bool)
-    chosen[:: -(-len(chosen) // MAX_POINTS)] = True
-    model = with_points(reconstruction, tracks, pixels, chosen)
+    model = with_some_points(reconstruction, MAX_POINTS)
     for camera_id in doubtful:
         set_camera(model, camera_id, _as_fisheye(model.camera(camera_id)))
     adjust(model, solving)

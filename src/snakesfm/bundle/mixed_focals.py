@@ -6,8 +6,7 @@ import numpy as np
 
 from snakesfm.bundle.interface import BundleAdjuster, SolverSettings
 from snakesfm.bundle.principal_points import observation_errors, shared_cameras
-from snakesfm.bundle.reading import read_tracks_and_pixels
-from snakesfm.bundle.selection import with_points
+from snakesfm.bundle.selection import with_some_points
 from snakesfm.geometry.camera import Camera
 from snakesfm.geometry.colmap_binding import pycolmap
 
@@ -37,12 +36,9 @@ def find_mixed_focals(
     if not shared or not solving.refine_focal:
         return {}
     solving = replace(solving, refine_distortion=False)
-    tracks, pixels = read_tracks_and_pixels(reconstruction)
-    chosen = np.zeros(len(tracks.points), dtype=bool)
-    wanted = max(LEAST_POINTS, POINTS_PER_IMAGE * reconstruction.num_reg_images())
-    chosen[:: -(-len(chosen) // wanted) or 1] = True
-    before = with_points(reconstruction, tracks, pixels, chosen)
-    after = with_points(reconstruction, tracks, pixels, chosen, shared)
+    most = max(LEAST_POINTS, POINTS_PER_IMAGE * reconstruction.num_reg_images())
+    before = with_some_points(reconstruction, most)
+    after = with_some_points(before, most, shared)
     for trial in (before, after):
         adjust(trial, solving)
     shared_of, errors_before = observation_errors(before)

@@ -133,3 +133,13 @@ def with_points(
         keypoint_ids,
     )
     return to_reconstruction(model, keypoints, [str(row) for row in range(count)])
+
+
+def with_some_points(
+    reconstruction: pycolmap.Reconstruction, most: int, split: Container[int] = ()
+) -> pycolmap.Reconstruction:
+    """The same with at most so many points, spread over all: enough to try a few numbers on."""
+    tracks, pixels = read_tracks_and_pixels(reconstruction)
+    chosen = np.zeros(len(tracks.points), dtype=bool)
+    chosen[:: -(-len(chosen) // most) or 1] = True
+    return with_points(reconstruction, tracks, pixels, chosen, split)
