@@ -16,25 +16,12 @@ from benchmarks.compare.sets import ImageSet
 from benchmarks.machine import describe_machine
 from snakesfm.blocks import choose_blocks, tile_names
 from snakesfm.job_logs import find_cost
+from snakesfm.pipeline import stages_between
 
 FEATURES = 5000
-EXTRACT = (
-    "index_images",
-    "extract_features",
-    "learn_vocabulary",
-    "describe_images",
-    "select_pairs",
-)
+EXTRACT = stages_between("index_images", "select_pairs")
 MATCH = ("match_pairs", "calibrate_cameras", "estimate_two_view")
-MAP = (
-    "build_view_graph",
-    "filter_view_graph",
-    "average_rotations",
-    "build_tracks",
-    "average_translations",
-    "triangulate_tracks",
-    "adjust_bundle",
-)
+MAP = stages_between("build_view_graph", "adjust_bundle")
 GROUPS = {"extract": EXTRACT, "match": MATCH, "map": MAP}
 AFTER = ("export_model", "evaluate_model", "render_report")
 STARTED = re.compile(r"^(\d{4}-\d\d-\d\dT\S+) \w+ (?!done in )", re.M)

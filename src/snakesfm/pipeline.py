@@ -24,3 +24,8 @@ STAGES: tuple[str, ...] = (
     "evaluate_model",
     "render_report",
 )
+
+
+def stages_between(first: str, last: str) -> tuple[str, ...]:
+    """The stages from one to another, both included."""
+    return STAGES[STAGES.index(first) : STAGES.index(last) + 1]

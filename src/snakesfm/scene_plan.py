@@ -29,7 +29,7 @@ from snakesfm.hloc_files import FEATURES, MATCHES, PAIRS
 from snakesfm.ingest.discover import MASK_DIGESTS_NAME, count_images, fingerprint_images
 from snakesfm.model_files import MODEL_FILES
 from snakesfm.pair_lists import estimate_pair_count, find_pair_list, pair_list_state
-from snakesfm.pipeline import STAGES
+from snakesfm.pipeline import STAGES, stages_between
 from snakesfm.resources import Load, job_load
 
 SCENE_ARTIFACTS = (
@@ -53,7 +53,7 @@ STAGES_IN_DETECTOR_PIXELS = (
     "triangulate_tracks",
     "adjust_bundle",
 )
-PROVISIONAL_STAGES = STAGES[STAGES.index("estimate_two_view") : STAGES.index("adjust_bundle") + 1]
+PROVISIONAL_STAGES = stages_between("estimate_two_view", "adjust_bundle")
 IMAGE_LISTS = ("images.txt", "images.bin")
 """Beside known cameras: which image is of which."""
 STAGES_WITH_NETWORKS = ("extract_features", "describe_images", "match_pairs")

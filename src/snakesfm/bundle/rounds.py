@@ -85,7 +85,7 @@ def adjust_rounds(
             mapper.round(f"round {number} with wider lenses", threshold, phase)
     while settings.register_images and mapper.register():
         mapper.round("registration", settings.thresholds_px[-1], "final")
-    if settings.refine_principal_points and settings.solver == "ceres" and not mapper.lenses_are_held:
+    if settings.refine_principal_points and mapper.may_try_lenses:
         mapper.refine_principal_points(sources)
     mapper.drop_outliers()
     mapper.look_for_mixed_focals()
@@ -200,7 +200,7 @@ class _Mapper:
     def widen_lenses(self) -> bool:
         """After a round, give cameras whose lens is not of their model a wider one; whether some were."""
         settings = self.settings
-        if not settings.widen_lenses or settings.solver != "ceres" or self.lenses_are_held:
+        if not settings.widen_lenses or not self.may_try_lenses:
             return False
         trying = self.reconstruction, self.adjust, self.late_solving("final")
         wider = find_wider_lenses(*trying) or find_stretched_cameras(*trying)
@@ -286,7 +286,7 @@ class _Mapper:
 
     def look_for_mixed_focals(self) -> None:
         """See which images share a camera though their focal lengths differ."""
-        if self.settings.solver == "ceres" and not self.lenses_are_held:
+        if self.may_try_lenses:
             self.mixed = find_mixed_focals(self.reconstruction, self.adjust, self.late_solving("final"))
 
     def drop_outliers(self) -> None:
@@ -306,9 +306,10 @@ class _Mapper:
         )
 
     @property
-    def lenses_are_held(self) -> bool:
-        """Whether the model could tell of no camera's lens: its noise need not be measured for that."""
-        return not shared_cameras(self.reconstruction, self.solving.constant_cameras)
+    def may_try_lenses(self) -> bool:
+        """Whether the model may tell of a camera's lens; else its noise need not be measured for that."""
+        shared = shared_cameras(self.reconstruction, self.solving.constant_cameras)
+        return self.settings.solver == "ceres" and bool(shared)
 
     def loss_scale_px(self) -> float:
         """Where the loss of a final round sets in."""

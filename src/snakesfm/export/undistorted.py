@@ -13,7 +13,8 @@ from snakesfm.arrays import Array
 from snakesfm.errors import ImageError
 from snakesfm.geometry.camera import Camera
 from snakesfm.geometry.colmap_binding import pycolmap
-from snakesfm.geometry.colmap_checks import check_binary, lack_of_space
+from snakesfm.geometry.colmap_checks import check_binary
+from snakesfm.geometry.colmap_files import lack_of_space
 from snakesfm.ingest.masks import find_mask, read_mask
 
 JPEG_SUFFIXES = (".jpg", ".jpeg")

@@ -1,11 +1,19 @@
 """Whether COLMAP's files are whole: on a full disk pycolmap leaves them cut off without a word."""
 
-import errno
 import os
 from pathlib import Path
 
 from snakesfm.geometry.colmap_binding import pycolmap
-from snakesfm.geometry.colmap_files import COUNT, ELEMENT, IMAGE, IMAGES_FILE, KEYPOINT, POINT, POINTS_FILE
+from snakesfm.geometry.colmap_files import (
+    COUNT,
+    ELEMENT,
+    IMAGE,
+    IMAGES_FILE,
+    KEYPOINT,
+    POINT,
+    POINTS_FILE,
+    lack_of_space,
+)
 
 # id, model, width and height; parameters of 8 bytes follow
 CAMERA_BYTES = 24
@@ -17,11 +25,6 @@ PARAMETER_BYTES = 8
 PLY_POINT_BYTES = 15
 PLY_HEAD_END = b"end_header\n"
 CHUNK_BYTES = 1 << 24
-
-
-def lack_of_space(folder: Path) -> OSError:
-    """The error of a folder without room for what pycolmap was to write there."""
-    return OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(folder))
 
 
 def check_binary(folder: Path, model: pycolmap.Reconstruction, parameters: int | None = None) -> None:

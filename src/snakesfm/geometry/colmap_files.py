@@ -41,6 +41,11 @@ OTHER_LAYOUT = (
 )
 
 
+def lack_of_space(folder: str | Path) -> OSError:
+    """The error of a folder without room for what pycolmap was to write there."""
+    return OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(folder))
+
+
 @contextmanager
 def written_files(reconstruction: pycolmap.Reconstruction) -> Iterator[Path]:
     """A folder for temporary files that holds the reconstruction's binary files; deleted at the end.
@@ -59,8 +64,7 @@ def written_files(reconstruction: pycolmap.Reconstruction) -> Iterator[Path]:
         raise OSError(error.errno, error.strerror, tempfile.gettempdir()) from error
     except struct.error as error:
         # where there is no more room pycolmap leaves its files cut off without a word
-        full = errno.ENOSPC
-        raise OSError(full, os.strerror(full), tempfile.gettempdir()) from error
+        raise lack_of_space(tempfile.gettempdir()) from error
 
 
 def read_image_head(file: BinaryIO) -> tuple[int, bytes, int]:
@@ -118,6 +122,6 @@ def check_layout() -> None:
             written = (Path(folder) / file).read_bytes()
             # a disk without a free block holds nothing of so short a file
             if not written:
-                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), tempfile.gettempdir())
+                raise lack_of_space(tempfile.gettempdir())
             if written != content:
                 raise ConfigError(OTHER_LAYOUT.format(version=pycolmap.__version__, file=file))

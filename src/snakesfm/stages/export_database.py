@@ -36,7 +36,7 @@ def run(job: StageJob) -> None:
     """
     from snakesfm.export.database import write_cameras, write_images, write_positions
     from snakesfm.geometry.colmap_binding import pycolmap
-    from snakesfm.geometry.colmap_checks import lack_of_space
+    from snakesfm.geometry.colmap_files import lack_of_space
 
     options: ExportDatabaseOptions = job.options
     index = ImageIndex.read(job.path("index"))

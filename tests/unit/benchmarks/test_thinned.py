@@ -1,10 +1,9 @@
 """Thinned image sets: which images, and a reference of these alone."""
 
 import shutil
-from pathlib import Path
 
-import pycolmap
 import pytest
+from full_disk import cut_references
 
 from benchmarks.compare.sets import read_sets
 from benchmarks.large_photographs import main as render
@@ -40,14 +39,7 @@ def test_every_second_image_that_the_reference_has(data, tmp_path) -> None:
 
 
 def test_a_reference_that_the_disk_has_no_room_for_is_no_success(data, tmp_path, monkeypatch) -> None:
-    write = pycolmap.Reconstruction.write_binary
-
-    def write_in_vain(model: pycolmap.Reconstruction, folder: str) -> None:
-        write(model, folder)
-        cut = Path(folder) / "images.bin"
-        cut.write_bytes(cut.read_bytes()[:-1])
-
-    monkeypatch.setattr(pycolmap.Reconstruction, "write_binary", write_in_vain)
+    cut_references(monkeypatch, "write_binary", "images.bin")
     with pytest.raises(OSError, match="No space left"):
         main([str(data), str(tmp_path), "--every", "2", "--least", "3"])
 

@@ -2,12 +2,12 @@
 
 import dataclasses
 import json
-from pathlib import Path
 
 import cv2
 import numpy as np
 import pycolmap
 import pytest
+from full_disk import cut_references
 from PIL import Image
 
 from snakesfm.errors import ConfigError
@@ -181,14 +181,7 @@ def test_equal_seeds_give_equal_bytes_and_another_seed_is_rendered_anew(small_sc
 
 
 def test_a_reference_that_the_disk_has_no_room_for_is_not_kept(tmp_path, monkeypatch) -> None:
-    write = pycolmap.Reconstruction.write_text
-
-    def write_in_vain(model: pycolmap.Reconstruction, folder: str) -> None:
-        write(model, folder)
-        cut = Path(folder) / "images.txt"
-        cut.write_bytes(cut.read_bytes()[:-1])
-
-    monkeypatch.setattr(pycolmap.Reconstruction, "write_text", write_in_vain)
+    cut_references(monkeypatch, "write_text", "images.txt")
     with pytest.raises(OSError, match="No space left"):
         make_demo(tmp_path / "scene", DemoOptions(image_count=3, width=80, height=60))
     assert not list(tmp_path.iterdir())

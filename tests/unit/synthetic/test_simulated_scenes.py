@@ -4,8 +4,8 @@ import tracemalloc
 from pathlib import Path
 
 import numpy as np
-import pycolmap
 import pytest
+from full_disk import cut_references
 
 from snakesfm.artifacts.features import LocalFeatures
 from snakesfm.artifacts.images import ImageIndex
@@ -227,16 +227,7 @@ def test_memory_does_not_grow_with_the_number_of_blocks(tmp_path: Path) -> None:
 
 
 def test_a_reference_that_the_disk_has_no_room_for_is_no_success(tmp_path: Path, monkeypatch) -> None:
-    write = pycolmap.Reconstruction.write_binary
-
-    def write_in_vain(model: pycolmap.Reconstruction, folder: str) -> None:
-        write(model, folder)
-        # temporary files are whole
-        if Path(folder).name == "reference":
-            cut = Path(folder) / "images.bin"
-            cut.write_bytes(cut.read_bytes()[:-1])
-
-    monkeypatch.setattr(pycolmap.Reconstruction, "write_binary", write_in_vain)
+    cut_references(monkeypatch, "write_binary", "images.bin")
     with pytest.raises(OSError, match="No space left"):
         main([str(tmp_path / "new"), "--images", "10"])
 
