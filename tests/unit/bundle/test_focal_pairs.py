@@ -197,6 +197,12 @@ def test_images_that_were_stretched_are_found_out(fy):
     assert error_deg < 0.1 < 0.5 < bent_deg
 
 
+def test_stretched_pixels_of_a_camera_gone_wild_later_stay_stretched():
+    camera, names, _ = stretched(450.0, max_distortion=1e-9)
+    assert "round 2 with wider lenses" in names
+    assert camera.params[1] / camera.params[0] == pytest.approx(0.9, rel=0.01)
+
+
 @pytest.mark.parametrize(
     "case",
     [
