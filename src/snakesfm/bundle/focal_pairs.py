@@ -10,10 +10,12 @@ focal length.
 from collections.abc import Collection, Sequence
 from dataclasses import replace
 
+import numpy as np
+
 from snakesfm.bundle.interface import BundleAdjuster, SolverSettings
-from snakesfm.bundle.lenses import set_camera
 from snakesfm.bundle.principal_points import shared_cameras
 from snakesfm.bundle.selection import with_some_points
+from snakesfm.bundle.trials import error_shares, read_cameras, try_cameras
 from snakesfm.geometry.camera import Camera
 from snakesfm.geometry.colmap_binding import pycolmap
 
@@ -44,7 +46,7 @@ def find_stretched_cameras(
     """Cameras of one focal length by id whose pixels are not square, with a model and parameters of two.
 
     One focal length bends the model so that its errors hardly show what is wrong: two are tried, on some of
-    the points, and taken where they come apart and one does not do as well.
+    the points, and taken where they come apart and the camera's images are not explained as well by one.
 
     Parameters
     ----------
@@ -52,19 +54,17 @@ def find_stretched_cameras(
     adjust, solving : the solver; cameras that it holds, or of few images, are no candidates.
     """
     shared = sorted(shared_cameras(reconstruction, solving.constant_cameras))
-    starts = {k: Camera.of_pycolmap(reconstruction.camera(k)) for k in shared}
-    starts = {k: camera for k, camera in starts.items() if camera.model in STRETCHED_MODELS}
-    if not starts:
+    wider = {
+        k: with_two_focals(camera, STRETCHED_MODELS[camera.model])
+        for k, camera in read_cameras(reconstruction, shared).items()
+        if camera.model in STRETCHED_MODELS
+    }
+    if not wider:
         return {}
-    trial = with_some_points(reconstruction, MAX_POINTS)
-    for camera_id, camera in starts.items():
-        set_camera(trial, camera_id, with_two_focals(camera, STRETCHED_MODELS[camera.model]))
-    adjust(trial, solving)
-    found = {k: Camera.of_pycolmap(trial.camera(k)) for k in starts}
-    found = {k: camera for k, camera in found.items() if _skew(camera) > MAX_SKEW}
-    if not found or one_focal_serves(trial, found, adjust, solving, STRETCHED_ERROR_RATIO):
-        return {}
-    return found
+    trial = try_cameras(with_some_points(reconstruction, MAX_POINTS), wider, adjust, solving)
+    found = {k: camera for k, camera in read_cameras(trial, wider).items() if _skew(camera) > MAX_SKEW}
+    square = find_square_cameras(trial, found, adjust, solving, STRETCHED_ERROR_RATIO)
+    return {k: camera for k, camera in found.items() if k not in square}
 
 
 def skewed_cameras(reconstruction: pycolmap.Reconstruction, cameras: Sequence[Camera]) -> list[int]:
@@ -84,14 +84,14 @@ def skewed_cameras(reconstruction: pycolmap.Reconstruction, cameras: Sequence[Ca
     ]
 
 
-def one_focal_serves(
+def find_square_cameras(
     reconstruction: pycolmap.Reconstruction,
     camera_ids: Collection[int],
     adjust: BundleAdjuster,
     solving: SolverSettings,
     max_error_ratio: float = MAX_ERROR_RATIO,
-) -> bool:
-    """Whether cameras explain their images about as well with one focal length.
+) -> dict[int, Camera]:
+    """Those cameras by id that explain their images about as well with one focal length, so changed.
 
     Parameters
     ----------
@@ -100,21 +100,14 @@ def one_focal_serves(
     adjust, solving : the solver.
     max_error_ratio : of mean reprojection errors with one focal length and with two, what is as well.
     """
-    trial = pycolmap.Reconstruction(reconstruction)
-    for camera_id in camera_ids:
-        set_one_focal(trial, camera_id)
-    adjust(trial, solving)
-    errors = []
-    for model in (reconstruction, trial):
-        model.update_point_3d_errors()
-        errors.append(model.compute_mean_reprojection_error())
-    return bool(errors[1] <= max_error_ratio * errors[0])
-
-
-def set_one_focal(reconstruction: pycolmap.Reconstruction, camera_id: int) -> None:
-    """Give a camera of two focal lengths the model of :func:`with_one_focal`."""
-    camera = Camera.of_pycolmap(reconstruction.camera(camera_id))
-    set_camera(reconstruction, camera_id, with_one_focal(camera))
+    if not camera_ids:
+        return {}
+    square = {k: with_one_focal(camera) for k, camera in read_cameras(reconstruction, camera_ids).items()}
+    trial = try_cameras(reconstruction, square, adjust, solving)
+    # the solver gives up what does not fit, so the median would hardly show it
+    shares = error_shares(reconstruction, trial, lambda errors: errors[np.isfinite(errors)].mean())
+    # a camera whose images are gone has none
+    return {k: camera for k, camera in square.items() if shares.get(k, 0.0) <= max_error_ratio}
 
 
 def _skew(camera: Camera) -> float:
@@ -126,6 +119,11 @@ def with_one_focal(camera: Camera) -> Camera:
     model = ONE_FOCAL_MODELS[camera.model]
     f, _, cx, cy, *terms = camera.params
     return replace(camera, model=model, params=(f, cx, cy, *terms[: _term_count(model)]))
+
+
+def with_equal_focals(camera: Camera) -> Camera:
+    """A camera of two focal lengths with the horizontal one twice."""
+    return replace(camera, params=(camera.params[0], camera.params[0], *camera.params[2:]))
 
 
 def with_two_focals(camera: Camera, model: str) -> Camera:

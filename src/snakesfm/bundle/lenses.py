@@ -8,6 +8,7 @@ from snakesfm.bundle.interface import BundleAdjuster, SolverSettings
 from snakesfm.bundle.principal_points import shared_cameras
 from snakesfm.bundle.reading import points_in_cameras, read_tracks_and_pixels
 from snakesfm.bundle.selection import with_some_points
+from snakesfm.bundle.trials import read_cameras, try_cameras
 from snakesfm.geometry.camera import Camera
 from snakesfm.geometry.colmap_binding import pycolmap
 from snakesfm.geometry.lens_fit import MAX_MISFIT, LensFit, fit_lenses
@@ -33,27 +34,19 @@ def find_wider_lenses(
     reconstruction : an adjusted model with free distortion; stays as it is.
     adjust, solving : the solver; cameras that it holds, or of few images, are no candidates.
     """
-    before = _fits(reconstruction, shared_cameras(reconstruction, solving.constant_cameras))
-    doubtful = [camera_id for camera_id, fit in before.items() if fit.misfit > MAX_MISFIT]
+    fits = _fits(reconstruction, shared_cameras(reconstruction, solving.constant_cameras))
+    doubtful = {
+        camera_id: _as_fisheye(reconstruction.camera(camera_id))
+        for camera_id, fit in fits.items()
+        if fit.misfit > MAX_MISFIT
+    }
     if not doubtful:
         return {}
-    model = with_some_points(reconstruction, MAX_POINTS)
-    for camera_id in doubtful:
-        set_camera(model, camera_id, _as_fisheye(model.camera(camera_id)))
-    adjust(model, solving)
-    after = _fits(model, doubtful)
-    return {
-        camera_id: Camera.of_pycolmap(model.camera(camera_id))
-        for camera_id in doubtful
-        if camera_id in after and after[camera_id].noise_px < NOISE_SHARE * before[camera_id].noise_px
-    }
-
-
-def set_camera(reconstruction: pycolmap.Reconstruction, camera_id: int, camera: Camera) -> None:
-    """Give a camera another model and parameters."""
-    target = reconstruction.camera(camera_id)
-    target.model = getattr(pycolmap.CameraModelId, camera.model)
-    target.params = list(camera.params)
+    some = with_some_points(reconstruction, MAX_POINTS)
+    trial = try_cameras(some, doubtful, adjust, solving)
+    before, after = _fits(some, doubtful), _fits(trial, doubtful)
+    better = [k for k in after if k in before and after[k].noise_px < NOISE_SHARE * before[k].noise_px]
+    return read_cameras(trial, better)
 
 
 def _fits(reconstruction: pycolmap.Reconstruction, camera_ids: Collection[int]) -> dict[int, LensFit]:
@@ -61,7 +54,7 @@ def _fits(reconstruction: pycolmap.Reconstruction, camera_ids: Collection[int]) 
         return {}
     tracks, pixels = read_tracks_and_pixels(reconstruction)
     camera_of, in_camera = points_in_cameras(reconstruction, tracks)
-    cameras = {camera_id: Camera.of_pycolmap(reconstruction.camera(camera_id)) for camera_id in camera_ids}
+    cameras = read_cameras(reconstruction, camera_ids)
     return fit_lenses(cameras, camera_of, tracks.images, in_camera, pixels)
 
 

@@ -1,22 +1,22 @@
 """Cameras that images share though they were taken with several focal lengths."""
 
+from collections import defaultdict
 from dataclasses import replace
 
 import numpy as np
 
 from snakesfm.bundle.interface import BundleAdjuster, SolverSettings
-from snakesfm.bundle.principal_points import observation_errors, shared_cameras
+from snakesfm.bundle.principal_points import shared_cameras
 from snakesfm.bundle.selection import with_some_points
-from snakesfm.geometry.camera import Camera
+from snakesfm.bundle.trials import error_shares
 from snakesfm.geometry.colmap_binding import pycolmap
 
 MAX_SPREAD = 0.02
 """Of focal lengths of one camera, the ninth decile over the first, less one: focusing changes less."""
 NOISE_SHARE = 0.7
 """Of the errors, what a focal length for each image must leave at most: freedom alone takes little."""
-# each image must see enough of them to tell its own focal length, and more cost time
-POINTS_PER_IMAGE = 15
-LEAST_POINTS = 2500
+# more points tell no more of two numbers, and cost time
+MAX_POINTS = 2500
 
 
 def find_mixed_focals(
@@ -36,24 +36,18 @@ def find_mixed_focals(
     if not shared or not solving.refine_focal:
         return {}
     solving = replace(solving, refine_distortion=False)
-    most = max(LEAST_POINTS, POINTS_PER_IMAGE * reconstruction.num_reg_images())
-    before = with_some_points(reconstruction, most)
-    after = with_some_points(before, most, shared)
+    before = with_some_points(reconstruction, MAX_POINTS)
+    after = with_some_points(before, MAX_POINTS, shared)
     for trial in (before, after):
         adjust(trial, solving)
-    shared_of, errors_before = observation_errors(before)
-    own_of, errors_after = observation_errors(after)
+    focals = defaultdict(list)
+    for image_id in before.reg_image_ids():
+        image, own = before.image(image_id), after.image(image_id).camera_id
+        if image.num_points3D:
+            focals[image.camera_id].append(after.camera(own).mean_focal_length())
     found = {}
-    for camera_id in sorted(shared):
-        # observations are in one order in both
-        mine = shared_of == camera_id
-        if not mine.any():
-            continue
-        focals = [
-            Camera.of_pycolmap(after.camera(own)).focal_px for own in np.unique(own_of[mine]).tolist()
-        ]
-        low, high = np.quantile(focals, [0.1, 0.9])
-        share = np.median(errors_after[mine]) / max(np.median(errors_before[mine]), 1e-9)
-        if high > (1.0 + MAX_SPREAD) * low and share < NOISE_SHARE:
+    for camera_id, share in error_shares(before, after).items():
+        low, high = np.quantile(focals[camera_id], [0.1, 0.9])
+        if camera_id in shared and high > (1.0 + MAX_SPREAD) * low and share < NOISE_SHARE:
             found[camera_id] = float(high / low - 1.0)
     return found

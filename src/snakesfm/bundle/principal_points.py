@@ -7,11 +7,11 @@ import numpy as np
 
 from snakesfm.arrays import Array
 from snakesfm.bundle.interface import BundleAdjuster, SolverSettings
-from snakesfm.bundle.reading import Tracks, points_in_cameras, read_tracks_and_pixels
+from snakesfm.bundle.reading import Tracks, read_tracks_and_pixels
 from snakesfm.bundle.selection import with_points
+from snakesfm.bundle.trials import error_shares
 from snakesfm.geometry.colmap_binding import pycolmap
 from snakesfm.geometry.lens_fit import MIN_IMAGES
-from snakesfm.grouping import rows_of_each
 
 # what is no farther than this many gaps from where it is assumed may as well be there
 SIGNIFICANCE = 3.0
@@ -91,12 +91,11 @@ def find_told_cameras(
     if not steady:
         return ToldCameras({}, {})
     fixed = _adjusted_half(reconstruction, *dealt, 0, adjust, replace(free, refine_principal_points=False))
-    before, after = _median_errors(fixed), _median_errors(halves[0])
+    shares = error_shares(fixed, halves[0])
     told, refused = {}, {}
     for camera_id, offset in steady.items():
         near = offset < offsets[1]
-        share = 1.0 if near else FAR_SHARE
-        if after[camera_id] < share * before[camera_id] and (near or offset < LARGEST_OFFSET):
+        if shares[camera_id] < (1.0 if near else FAR_SHARE) and (near or offset < LARGEST_OFFSET):
             told[camera_id] = offset
         elif not near:
             refused[camera_id] = offset
@@ -129,23 +128,3 @@ def _adjusted_half(
     model = with_points(reconstruction, tracks, pixels, chosen)
     adjust(model, replace(solving, function_tolerance=solving.function_tolerance * COARSE))
     return model
-
-
-def observation_errors(reconstruction: pycolmap.Reconstruction) -> tuple[Array, Array]:
-    """Id of the camera (L,) int64 of each observation, and its reprojection error (L,) in pixels.
-
-    It is infinite where the camera does not see the point, as of one that came to lie behind it.
-    """
-    tracks, pixels = read_tracks_and_pixels(reconstruction)
-    camera_of, in_camera = points_in_cameras(reconstruction, tracks)
-    errors = np.zeros(len(camera_of))
-    for camera_id, mine in rows_of_each(camera_of):
-        seen = reconstruction.camera(camera_id).img_from_cam(in_camera[mine])
-        errors[mine] = np.linalg.norm(seen - pixels[mine], axis=1)
-    return camera_of, np.where(np.isnan(errors), np.inf, errors)
-
-
-def _median_errors(reconstruction: pycolmap.Reconstruction) -> dict[int, float]:
-    """Median reprojection errors in pixels, by the ids of the cameras that have observations."""
-    camera_of, errors = observation_errors(reconstruction)
-    return {int(camera_id): float(np.median(errors[mine])) for camera_id, mine in rows_of_each(camera_of)}

@@ -12,10 +12,10 @@ from snakesfm.bundle.filtering import (
     filter_observations,
 )
 from snakesfm.bundle.focal_pairs import (
+    find_square_cameras,
     find_stretched_cameras,
-    one_focal_serves,
-    set_one_focal,
     skewed_cameras,
+    with_equal_focals,
     with_one_focal,
     with_two_focals,
 )
@@ -23,12 +23,13 @@ from snakesfm.bundle.image_sources import ImageSource
 from snakesfm.bundle.interface import SolverSettings, bundle_adjuster
 from snakesfm.bundle.keypoint_noise import keypoint_noise_px
 from snakesfm.bundle.keypoint_refinement import refine_keypoints
-from snakesfm.bundle.lenses import find_wider_lenses, set_camera
+from snakesfm.bundle.lenses import find_wider_lenses
 from snakesfm.bundle.mixed_focals import find_mixed_focals
 from snakesfm.bundle.principal_points import find_told_cameras, shared_cameras
 from snakesfm.bundle.registration import left_out_images, register_left_out
 from snakesfm.bundle.round_settings import RoundRecord, RoundSettings
 from snakesfm.bundle.selection import adjust_selection
+from snakesfm.bundle.trials import read_cameras, set_cameras
 from snakesfm.bundle.wild_cameras import WildCause, longest_focals_px, reset_wild_cameras
 from snakesfm.geometry.camera import Camera
 from snakesfm.geometry.colmap_binding import pycolmap
@@ -203,11 +204,13 @@ class _Mapper:
         if not settings.widen_lenses or not self.may_try_lenses:
             return False
         trying = self.reconstruction, self.adjust, self.late_solving("final")
-        wider = find_wider_lenses(*trying) or find_stretched_cameras(*trying)
+        fisheyes = find_wider_lenses(*trying)
+        wider = fisheyes or find_stretched_cameras(*trying)
+        set_cameras(self.reconstruction, wider)
         for camera_id, camera in wider.items():
-            set_camera(self.reconstruction, camera_id, camera)
-            # what went wild later would else go back to the former model
-            self.cameras[camera_id - 1] = replace(camera, source=self.cameras[camera_id - 1].source)
+            # what goes wild later goes back to it; the focal lengths of a lens, once equal, may be tied
+            start = with_equal_focals(camera) if fisheyes else camera
+            self.cameras[camera_id - 1] = replace(start, source=self.cameras[camera_id - 1].source)
         return bool(wider)
 
     def tie_focal_lengths(self) -> None:
@@ -217,18 +220,19 @@ class _Mapper:
         if not skewed or settings.solver != "ceres":
             return
         solving = self.late_solving("last")
-        if not one_focal_serves(self.reconstruction, skewed, self.adjust, solving):
+        square = find_square_cameras(self.reconstruction, skewed, self.adjust, solving)
+        if not square:
             return
         # what was just changed does not show the noise of its keypoints
         self.settings = replace(settings, loss_scale_px=solving.loss_scale_px)
         starts = list(self.cameras)
-        for camera_id in skewed:
-            set_one_focal(self.reconstruction, camera_id)
+        set_cameras(self.reconstruction, square)
+        for camera_id in square:
             self.cameras[camera_id - 1] = with_one_focal(starts[camera_id - 1])
         self.round("last pass with one focal length", settings.thresholds_px[-1], "last")
-        for camera_id in skewed:
-            camera = Camera.of_pycolmap(self.reconstruction.camera(camera_id))
-            set_camera(self.reconstruction, camera_id, with_two_focals(camera, starts[camera_id - 1].model))
+        tied = read_cameras(self.reconstruction, square)
+        two = {k: with_two_focals(camera, starts[k - 1].model) for k, camera in tied.items()}
+        set_cameras(self.reconstruction, two)
         self.cameras, self.settings = starts, settings
 
     def record(

@@ -14,6 +14,9 @@ from snakesfm.geometry.colmap_binding import pycolmap
 from snakesfm.geometry.colmap_writing import keypoints_of_observations
 from snakesfm.grouping import offsets_of
 
+# each image must see enough of them to tell its own numbers
+POINTS_PER_IMAGE = 15
+
 
 def select_points(point_rows: Array, images: Array, count: int, per_image: int, seed: int) -> Array:
     """Points that are among the first ``per_image`` of any image, those seen by most images first.
@@ -138,7 +141,8 @@ def with_points(
 def with_some_points(
     reconstruction: pycolmap.Reconstruction, most: int, split: Container[int] = ()
 ) -> pycolmap.Reconstruction:
-    """The same with at most so many points, spread over all: enough to try a few numbers on."""
+    """The same with so many points at most, or 15 per image if more, spread over all: for trials."""
+    most = max(most, POINTS_PER_IMAGE * reconstruction.num_reg_images())
     tracks, pixels = read_tracks_and_pixels(reconstruction)
     chosen = np.zeros(len(tracks.points), dtype=bool)
     chosen[:: -(-len(chosen) // most) or 1] = True

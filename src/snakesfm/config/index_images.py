@@ -10,7 +10,7 @@ from snakesfm.config.base import StageOptions
 class IndexImagesOptions(StageOptions):
     """How images are assigned to cameras, and where intrinsics start."""
 
-    stage_version: ClassVar[int] = 5
+    stage_version: ClassVar[int] = 6
 
     camera_sharing: Literal["auto", "exif", "single", "per_folder", "per_image"] = "auto"
     """Which images share a camera: 'auto' compares EXIF or, without it, folder, size and numbering;

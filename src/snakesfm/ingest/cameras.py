@@ -22,6 +22,8 @@ Sides = tuple[int, int]
 
 # so many camera models never agree on one image size by themselves: someone cropped to it
 MODELS_OF_ONE_SIZE = 5
+# sensors agree on a size, as telephones do on 4032 x 3024; images are cropped to smaller ones for a use
+FULL_SIZE_PX = 8_000_000
 # images without EXIF are of one camera where at most one size comes with so many images
 IMAGES_PER_SIZE = 20
 # or those of one size where they are so many of a folder's images, beside a few strays
@@ -153,12 +155,16 @@ def assign_cameras(
 
 
 def folders_of_one_size(photographs: Sequence[Photograph]) -> set[str]:
-    """Folders whose images have all one size though many camera models took them: someone cropped them."""
+    """Folders whose images have all one size though many camera models took them: someone cropped them.
+
+    Models do not count whose photographs are large and state this size in EXIF.
+    """
     sizes = defaultdict(set)
     bodies = defaultdict(set)
     for photograph in photographs:
         sizes[photograph.folder].add((photograph.width, photograph.height))
-        if photograph.body:
+        whole = is_of_stated_size(photograph.exif, photograph.width, photograph.height)
+        if photograph.body and not (whole and photograph.width * photograph.height >= FULL_SIZE_PX):
             bodies[photograph.folder].add(photograph.body)
     return {
         folder
@@ -278,7 +284,18 @@ def _scattered_folders(photographs: Sequence[Photograph], runs: set[tuple[Series
 def warn_of_own_cameras(
     photographs: Sequence[Photograph], found: ImageCameras, sharing: Sharing
 ) -> list[str]:
-    """A sentence where most images were given a camera each though they have few sizes, else none."""
+    """A sentence where images count as cropped to one size, or most have a camera each though few sizes."""
+    folders = folders_of_one_size(photographs) if sharing == "auto" else set()
+    cropped = sum(
+        p.folder in folders and p.body is not None and found.cameras[row].source != "given"
+        for p, row in zip(photographs, found.camera_ids.tolist(), strict=True)
+    )
+    if cropped:
+        return [
+            f"{cropped} images of one size, from {MODELS_OF_ONE_SIZE} camera models or more, count as "
+            "cropped: each has a camera of its own, and focal lengths in EXIF are not used. If nobody "
+            "cropped them, set index_images={camera_sharing: exif}."
+        ]
     counts = np.bincount(found.camera_ids, minlength=len(found.cameras))
     own = [
         photograph

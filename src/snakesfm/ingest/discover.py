@@ -39,8 +39,9 @@ def walk_images(folder: Path | str) -> Iterator[str]:
 def list_images(folder: Path | str) -> list[str]:
     """The image files of a folder at any depth.
 
-    Files and folders whose name starts with a dot are skipped. Symbolic links are followed, but not back
-    into a folder that holds the link. A link that leads nowhere is listed too: its user should hear of it.
+    Files and folders whose name starts with a dot are skipped, and folders whose name starts with @, where
+    network drives keep thumbnails. Symbolic links are followed, but not back into a folder that holds the
+    link. A link that leads nowhere is listed too: its user should hear of it.
 
     Returns
     -------
@@ -132,11 +133,12 @@ def digest_images(
             digests[name] = known[name][1]
     missing = [name for name in names if name not in digests]
     digests |= dict(zip(missing, _digest_files([root / n for n in missing], threads), strict=True))
+    # the time of the content may be any, that of the file is the clock's at each change
     newest = time.time_ns() - SETTLED_NS
     kept = {
         name: (stamp, digests[name])
         for name, stamp in stamps.items()
-        if stamp is not None and max(stamp[1:]) < newest and digests[name]
+        if stamp is not None and stamp[2] < newest and digests[name]
     }
     if cache_file is not None and kept != known:
         _write_cache(Path(cache_file), str(root), kept)
@@ -160,6 +162,8 @@ def _walk(
         if entry.name.startswith("."):
             continue
         if _is(entry, "is_dir"):
+            if entry.name.startswith("@"):
+                continue
             target = entry.stat()
             if (target.st_dev, target.st_ino) not in above:
                 yield from _walk(Path(entry.path), f"{prefix}{entry.name}/", above, suffixes)

@@ -18,8 +18,8 @@ FOCAL_RATIO_RANGE = (0.25, 25.0)
 # sensors are 4:3 or longer; what is squarer or as long as a panorama was cropped or stitched
 ASPECT_RANGE = (1.3, 2.4)
 ASPECT_TOLERANCE = 0.02
-# thermal, multispectral and machine vision cameras have 5:4 and 6:5
-SQUAREST_SENSOR = 1.15
+# thermal, multispectral and machine vision cameras have 5:4 and 6:5, action cameras 8:7
+SQUAREST_SENSOR = 1.1
 NO_PLACE: Triple = (math.nan, math.nan, math.nan)
 
 

@@ -4,7 +4,6 @@ import struct
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import zip_longest
 from pathlib import Path
 
 import numpy as np
@@ -258,11 +257,12 @@ def _image_cameras(path: Path) -> dict[str, int]:
 
 
 def _text_image_cameras(text: str) -> Iterator[tuple[str, int]]:
-    # every image has two lines, and the second, its points, may be empty
-    lines = [line.strip() for line in text.splitlines() if not line.startswith("#")]
-    for line, points in zip_longest(lines[::2], lines[1::2], fillvalue=""):
+    lines = (line.strip() for line in text.splitlines() if not line.startswith("#"))
+    for line in lines:
         if not line:
             continue
+        # every image has two lines, and the second, its points, may be empty
+        points = next(lines, "")
         # a list without lines of points would lose every second image
         if len(points.split()) % 3 or (points and not points.split()[-1].lstrip("-").isdigit()):
             raise ValueError(f"expected the points of the image before, found '{points[:60]}'")

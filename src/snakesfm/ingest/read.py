@@ -10,7 +10,7 @@ import hashlib
 import mmap
 import os
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
 from functools import partial
 from io import BytesIO
@@ -95,10 +95,7 @@ def read_header(path: Path | str) -> ImageHeader:
     try:
         with path.open("rb") as file:
             _check_not_empty(path, os.fstat(file.fileno()).st_size)
-            with (
-                mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data,
-                _open(path, file) as image,
-            ):
+            with _content(file) as data, _open(path, file) as image:
                 _check_end(path, image, data)
                 width, height = _stored_size(image)
                 return ImageHeader(width, height, read_exif(image))
@@ -176,6 +173,14 @@ def _read_bytes(path: Path, sha256: str) -> bytes:
         raise SceneError(f"{path} was changed after the images were indexed: start the same command again.")
     _check_not_empty(path, len(data))
     return data
+
+
+def _content(file: BinaryIO) -> AbstractContextManager[bytes | mmap.mmap]:
+    """What a file holds, of which only the end is read where its file system maps files."""
+    try:
+        return mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+    except OSError:
+        return nullcontext(file.read())
 
 
 def _check_not_empty(path: Path, size: int) -> None:

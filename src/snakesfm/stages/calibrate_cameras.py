@@ -30,6 +30,8 @@ from snakesfm.stages.job import StageJob
 if TYPE_CHECKING:
     from snakesfm.config.calibrate_cameras import CalibrateCamerasOptions
 
+Covered = Mapping[tuple[int, int], Array]
+
 GIVEN_SIGMA = 0.0
 # a model of fewer hardly tells focal lengths and distortion apart
 LEAST_IMAGES = 5
@@ -83,7 +85,7 @@ def _calibrate(
     index: ImageIndex,
     cameras: list[Camera],
     matched: "_MatchedImages",
-    covered: Mapping[tuple[int, int], Array],
+    covered: Covered,
 ) -> tuple[list[Camera], Array, Array]:
     # not needed where all cameras are given
     from snakesfm.calibration.focal import MatchedPair, calibrate_focals, choose_pairs
@@ -98,22 +100,21 @@ def _calibrate(
         )
 
     chosen, looked_at = choose(options.pairs_per_camera), options.pairs_per_camera
-    while len(still := matched.still_pairs(chosen, MOVED_PX)):
+    while len(still := matched.still_pairs(chosen, covered, MOVED_PX)):
         counts[still] = 0
         # where most pairs are such, their number is that of the images
         looked_at *= 2
-        counts[matched.still_pairs(choose(looked_at), MOVED_PX)] = 0
+        counts[matched.still_pairs(choose(looked_at), covered, MOVED_PX)] = 0
         chosen = choose(options.pairs_per_camera)
     progress = job.progress(len(chosen), "pairs")
     pairs: dict[int, MatchedPair] = {}
-    for row, first, second in matched.read(chosen):
+    for row, first, second in matched.read_moving(chosen, covered):
         i, j = matched.pairs[row].tolist()
-        moving = find_moving_matches(covered, matched.sizes[[i, j]], first, second)
         pairs[row] = MatchedPair(
             int(index.camera_ids[i]),
             int(index.camera_ids[j]),
-            first[moving],
-            second[moving],
+            first,
+            second,
             job.seed_for(str(index.names[i]), str(index.names[j])),
         )
         progress.step()
@@ -247,11 +248,19 @@ class _MatchedImages:
             best = matches[np.argsort(-scores, kind="stable")]
             yield row, self._keypoints[i][best[:, 0]], self._keypoints[j][best[:, 1]]
 
-    def still_pairs(self, rows: Array, least_px: float) -> Array:
+    def read_moving(self, rows: Array, covered: Covered) -> Iterator[tuple[int, Array, Array]]:
+        """The same without the matches on overlays."""
+        for row, first, second in self.read(rows):
+            moving = find_moving_matches(covered, self.sizes[self.pairs[row]], first, second)
+            yield row, first[moving], second[moving]
+
+    def still_pairs(self, rows: Array, covered: Covered, least_px: float) -> Array:
         """Those of some rows whose matches move less in the median; each pair is looked at once."""
         looked_at = self._moved_px
-        for row, first, second in self.read(rows[[row not in looked_at for row in rows.tolist()]]):
-            looked_at[row] = float(np.median(np.linalg.norm(first - second, axis=1)))
+        new = rows[[row not in looked_at for row in rows.tolist()]]
+        for row, first, second in self.read_moving(new, covered):
+            moved = np.linalg.norm(first - second, axis=1)
+            looked_at[row] = float(np.median(moved)) if len(moved) else 0.0
         return rows[[looked_at[row] < least_px for row in rows.tolist()]]
 
     def deal(self, rows: Array, count: int) -> list[PairMatches]:

@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 from synthetic_scene import run_rounds, true_model
 
-from snakesfm.bundle.interface import SolverSettings
+from snakesfm.bundle import lenses
+from snakesfm.bundle.interface import SolverSettings, bundle_adjuster
+from snakesfm.bundle.model import to_reconstruction
 from snakesfm.geometry.camera import Camera
 from snakesfm.geometry.rotations import angle_of
 from snakesfm.synthetic.problems import Layout, make_problem
@@ -67,3 +69,19 @@ def test_a_lens_gone_wild_later_goes_back_to_the_wider_model() -> None:
     camera, names, _ = adjusted(FISHEYE, max_distortion=1e-9)
     assert "round 2 with wider lenses" in names
     assert (camera.model, len(camera.params)) == ("OPENCV_FISHEYE", 8)
+
+
+def test_errors_are_compared_on_the_points_that_were_tried(monkeypatch) -> None:
+    monkeypatch.setattr(lenses, "MAX_MISFIT", -1.0)
+    monkeypatch.setattr(lenses, "MAX_POINTS", 100)
+    made = make_problem(14, 900, "facade", noise_px=0.05, camera=RADIAL, seed=3)
+    keypoints = [points.copy() for points in made.keypoints]
+    # of 15 for each image every so many are tried: all others are worse
+    step = -(-len(made.points) // (15 * 14))
+    random = np.random.default_rng(0)
+    for point in np.flatnonzero(np.arange(len(made.points)) % step).tolist():
+        for row in range(*made.track_offsets[point : point + 2].tolist()):
+            image, keypoint = made.track_image_ids[row], made.track_keypoint_ids[row]
+            keypoints[image][keypoint] += random.normal(0.0, 0.5, 2)
+    model = to_reconstruction(true_model(made), keypoints, [f"{k}.jpg" for k in range(14)])
+    assert lenses.find_wider_lenses(model, bundle_adjuster("ceres"), SolverSettings()) == {}

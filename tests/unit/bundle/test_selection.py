@@ -12,7 +12,7 @@ from snakesfm.bundle.ceres import adjust_ceres
 from snakesfm.bundle.following import Views, follow_cameras
 from snakesfm.bundle.interface import SolverSettings
 from snakesfm.bundle.model import from_reconstruction, to_reconstruction
-from snakesfm.bundle.selection import adjust_selection, select_points
+from snakesfm.bundle.selection import adjust_selection, select_points, with_some_points
 from snakesfm.geometry.poses import center_of
 from snakesfm.synthetic.problems import make_problem
 
@@ -49,6 +49,13 @@ def test_the_number_of_all_observations_chooses_all_points():
     model, _ = perturbed()
     owners = np.repeat(np.arange(len(model.points)), np.diff(model.offsets))
     assert select_points(owners, model.image_ids, len(model.points), 10_000, 0).all()
+
+
+def test_trials_take_few_points_but_fifteen_for_each_image():
+    _, whole = perturbed()
+    assert 90 <= with_some_points(whole, 50).num_points3D() <= 15 * 12
+    assert 200 <= with_some_points(whole, 400).num_points3D() <= 400
+    assert with_some_points(whole, 1000).num_points3D() == whole.num_points3D()
 
 
 @pytest.mark.parametrize("per_image", [60, 10_000])

@@ -16,7 +16,16 @@ from snakesfm.ingest.discover import (
 )
 
 SETTLED = "snakesfm.ingest.discover.SETTLED_NS"
-ODD_NAMES = ["a b.jpg", "#1.png", "{x}.JPEG", "dir/a b.jpg", "Ünï/写真.TIF", "z.WebP", "scan.bmp"]
+ODD_NAMES = [
+    "a b.jpg",
+    "#1.png",
+    "@me.jpg",
+    "{x}.JPEG",
+    "dir/a b.jpg",
+    "Ünï/写真.TIF",
+    "z.WebP",
+    "scan.bmp",
+]
 
 
 def touch_all(folder, names, content=b"x", age_s=60):
@@ -29,7 +38,8 @@ def touch_all(folder, names, content=b"x", age_s=60):
 
 
 def test_lists_odd_names_at_any_depth_sorted(tmp_path):
-    touch_all(tmp_path, [*ODD_NAMES, ".hidden.jpg", ".git/a.jpg", "notes.txt", "jpg", "movie.mp4"])
+    others = [".hidden.jpg", ".git/a.jpg", "dir/@eaDir/a b.jpg/THUMB.jpg", "notes.txt", "jpg", "movie.mp4"]
+    touch_all(tmp_path, [*ODD_NAMES, *others])
     (tmp_path / "folder.jpg").mkdir()
     assert list_images(tmp_path) == sorted(ODD_NAMES)
 
@@ -87,9 +97,11 @@ def test_fingerprint_follows_content_not_time(tmp_path, monkeypatch):
     assert fingerprint_images(images, cache) not in (first, changed)
 
 
-def test_unchanged_file_is_not_read_again(tmp_path, monkeypatch):
+# a camera's clock may be ahead
+@pytest.mark.parametrize("age_s", [60, -3600])
+def test_unchanged_file_is_not_read_again(tmp_path, monkeypatch, age_s):
     monkeypatch.setattr(SETTLED, 0)
-    touch_all(tmp_path / "i", ["a.jpg"], b"one")
+    touch_all(tmp_path / "i", ["a.jpg"], b"one", age_s)
     cache = tmp_path / "digests.json"
     before = digest_images(tmp_path / "i", ["a.jpg"], cache)
     cache.write_text(cache.read_text().replace(before["a.jpg"], "remembered"))

@@ -150,8 +150,26 @@ def test_own_cameras_of_few_sizes_are_doubted():
     assert warn(square, [Camera("PINHOLE", 760, 760, (700.0 + k, 700, 380, 380)) for k in range(6)]) == []
     assert warn(square + numbered("f", 6, FRAMES)) == []
     assert warn(photos("a", [(760, 700 + k // 2) for k in range(12)])) == []
-    bodies = [Photograph(f"{k}.jpg", 760, 1140, Exif("X", f"M{k}")) for k in range(6)]
+    bodies = [Photograph(f"{k}.jpg", 760, 1140 + k % 2, Exif("X", f"M{k}")) for k in range(6)]
     assert warn(bodies) == []
+
+
+def test_images_that_count_as_cropped_to_one_size_are_told():
+    bodies = [Photograph(f"{k}.jpg", 760, 1140, Exif("X", f"M{k % 6}")) for k in range(12)]
+    others = photos("a", [(760, 1140)] * 3, PHONE)
+    known = [Camera("PINHOLE", 760, 1140, (700, 700, 380, 570)), *[None] * 14]
+
+    def warn(known, **changes):
+        found = assign(bodies + others, known, **changes)
+        return warn_of_own_cameras(bodies + others, found, changes.get("sharing", "auto"))
+
+    (line,) = warn(known)
+    assert line.startswith(
+        "11 images of one size, from 5 camera models or more, count as cropped: each has"
+    )
+    assert "index_images={camera_sharing: exif}" in line
+    assert warn(known, sharing="exif") == warn(known, sharing="single") == []
+    assert warn([known[0]] * 12 + [None] * 3) == []
 
 
 def test_cropped_images_are_not_trusted():
@@ -164,9 +182,15 @@ def test_cropped_images_are_not_trusted():
 
 @pytest.mark.parametrize(
     ("size", "stated", "cameras"),
-    [((950, 760), (950, 760), 1), ((950, 760), (1140, 760), 3), ((760, 760), (760, 760), 3)],
+    [
+        ((950, 760), (950, 760), 1),
+        # GoPro
+        ((5568, 4872), (5568, 4872), 1),
+        ((950, 760), (1140, 760), 3),
+        ((760, 760), (760, 760), 3),
+    ],
 )
-def test_images_of_a_sensor_of_5_to_4_share_a_camera(size, stated, cameras):
+def test_images_of_a_sensor_of_5_to_4_or_8_to_7_share_a_camera(size, stated, cameras):
     exif = dataclasses.replace(PHONE, width=stated[0], height=stated[1])
     found = assign(photos("a", [size] * 3, exif))
     assert len(found.cameras) == cameras
@@ -181,6 +205,28 @@ def test_one_size_of_many_cameras_is_not_trusted():
     assert found.cameras[0].focal_px == pytest.approx(100 * np.hypot(760, 1140) / np.hypot(36, 24))
     three = assign(mixed[:3])
     assert {camera.source for camera in three.cameras} == {"exif"}
+
+
+@pytest.mark.parametrize(
+    ("size", "stated", "whole"),
+    [
+        ((4032, 3024), (4032, 3024), True),
+        ((3024, 4032), (4032, 3024), True),
+        # cut from the left
+        ((4032, 3024), (5472, 3648), False),
+        ((4032, 3024), (0, 0), False),
+        # the size of a web page
+        ((1024, 768), (1024, 768), False),
+    ],
+)
+def test_telephones_that_agree_on_a_large_size_are_cameras_of_their_own(size, stated, whole):
+    phones = [
+        Photograph(f"{k}.jpg", *size, Exif("X", f"M{k % 5}", "", 4.2, 26.0, *stated)) for k in range(20)
+    ]
+    found = assign(phones)
+    assert len(found.cameras) == (5 if whole else 20)
+    assert {camera.source for camera in found.cameras} == {"exif" if whole else "default"}
+    assert np.isfinite(found.focal_exif_px).all() == whole
 
 
 def test_crops_of_many_cameras_do_not_share_one_where_another_is_known():

@@ -64,6 +64,13 @@ def test_list_of_images_decides(tmp_path):
     assert found[2].params[0] == 355
 
 
+@pytest.mark.parametrize("points", ["", "1.5 2.5 -1 3 4 17"])
+def test_blank_lines_before_an_image_hide_none(tmp_path, points):
+    images = f"# list\n\n1 {POSE} 2 a.jpg\n{points}\n \n\n2 {POSE} 1 b.jpg\n{points}\n3 {POSE} 1 c.jpg"
+    known = read_known_cameras(write(tmp_path, cameras=SAME, images=images))
+    assert known.camera_of == {"a.jpg": 2, "b.jpg": 1, "c.jpg": 1}
+
+
 def test_image_missing_from_the_list_takes_the_one_camera_of_its_size(tmp_path):
     known = read_known_cameras(write(tmp_path, cameras=TWO, images=f"1 {POSE} 1 a.jpg\n\n"))
     found = match(known, {"a.jpg": (800, 600), "b.jpg": (640, 480), "c.jpg": (100, 100)})

@@ -1,4 +1,6 @@
+import errno
 import io
+import mmap
 import struct
 
 import cv2
@@ -46,6 +48,19 @@ def test_jpeg_is_what_pil_and_colmap_decode(tmp_path, picture):
     np.testing.assert_array_equal(pixels.rgb, np.asarray(Image.open(path)))
     colmap = pycolmap.Bitmap.read(path, True).to_array()
     assert np.abs(pixels.rgb.astype(int) - colmap).max() <= 2
+
+
+def test_a_file_system_that_maps_no_files_is_read(tmp_path, picture, monkeypatch):
+    def refuse(*_, **__):
+        raise OSError(errno.ENODEV, "No such device")
+
+    path = save(picture, tmp_path / "a.jpg", exif=orientation(6).tobytes())
+    expected = read_header(path)
+    monkeypatch.setattr(mmap, "mmap", refuse)
+    assert read_header(path) == expected
+    path.write_bytes(path.read_bytes()[:-200])
+    with pytest.raises(ImageError, match="truncated"):
+        read_header(path)
 
 
 @pytest.mark.parametrize("name", ["a.jpg", "a.png", "a.tif"])

@@ -1,4 +1,4 @@
-"""Focal lengths where every place was photographed several times."""
+"""Focal lengths where many matches stand still: of places photographed several times, and on overlays."""
 
 from dataclasses import replace
 from itertools import combinations
@@ -58,6 +58,47 @@ def burst(copies):
     )
 
 
+def with_overlay(made, rows):
+    """A scene with rows of 78 keypoints in all images that stand still and match, twice in the first pair.
+
+    All other matches of the first pair are gone.
+    """
+    places = np.stack(np.meshgrid(np.arange(8.0, 632.0, 8.0), 440.0 + 8.0 * np.arange(rows)), -1)
+    random = np.random.default_rng(1)
+    overlays = [places.reshape(-1, 2) + random.normal(0.0, 0.1, (78 * rows, 2)) for _ in made.keypoints]
+    starts = np.array([len(points) for points in made.keypoints])
+    matches = [
+        np.concatenate([own, starts[pair] + np.arange(78 * rows)[:, None]])
+        for pair, own in zip(made.pairs, np.split(made.matches, made.match_offsets[1:-1]), strict=True)
+    ]
+    matches[0] = np.tile(matches[0][-78 * rows :], (2, 1))
+    return replace(
+        made,
+        cameras=(made.cameras[0].with_focal(WRONG * made.cameras[0].focal_px, "default"),),
+        keypoints=[np.concatenate(parts) for parts in zip(made.keypoints, overlays, strict=True)],
+        matches=np.concatenate(matches),
+        match_offsets=np.r_[0, np.cumsum([len(part) for part in matches])],
+    )
+
+
+def calibrated(scene, folder):
+    """What the stage makes of a scene."""
+    inputs = write_scene(scene, folder)
+    PairMatches(
+        scene.pairs.astype(np.int32),
+        np.full(len(scene.pairs), "", dtype=object),
+        scene.match_offsets,
+        scene.matches.astype(np.int32),
+        np.ones(len(scene.matches), np.float32),
+    ).write(folder / "matches.h5", HEADER)
+    inputs = {name: inputs[name] for name in ("index", "features")} | {"matches": folder / "matches.h5"}
+    job = StageJob(
+        "calibrate_cameras", "scene", inputs, (folder / "out.h5",), CalibrateCamerasOptions(), threads=1
+    )
+    calibrate_cameras.run(job)
+    return CalibratedCameras.read(job.output)
+
+
 @pytest.mark.parametrize(
     ("count", "moved_px", "source"), [(5, None, "estimated"), (5, 0.0, "default"), (26, None, "estimated")]
 )
@@ -67,20 +108,18 @@ def test_pairs_of_one_place_do_not_take_the_place_of_those_that_tell(
     if moved_px is not None:
         monkeypatch.setattr(calibrate_cameras, "MOVED_PX", moved_px)
     made, copies = burst(count)
-    inputs = write_scene(copies, tmp_path)
-    PairMatches(
-        copies.pairs.astype(np.int32),
-        np.full(len(copies.pairs), "", dtype=object),
-        copies.match_offsets,
-        copies.matches.astype(np.int32),
-        np.ones(len(copies.matches), np.float32),
-    ).write(tmp_path / "matches.h5", HEADER)
-    inputs = {name: inputs[name] for name in ("index", "features")} | {"matches": tmp_path / "matches.h5"}
-    job = StageJob(
-        "calibrate_cameras", "scene", inputs, (tmp_path / "out.h5",), CalibrateCamerasOptions(), threads=1
-    )
-    calibrate_cameras.run(job)
-    found = CalibratedCameras.read(job.output)
+    found = calibrated(copies, tmp_path)
     assert found.sources.tolist() == [source]
     expected = 1.0 if source == "estimated" else WRONG
     assert found.params[0, 0] / made.cameras[0].focal_px == pytest.approx(expected, rel=0.02)
+
+
+def test_pairs_of_which_most_matches_are_on_an_overlay_tell_focal_lengths(tmp_path):
+    made = make_problem(PLACES, 600, "ring", noise_px=0.1, seed=7)
+    scene = with_overlay(made, 4)
+    shares = 78 * 4 / np.diff(scene.match_offsets)
+    assert shares[1:].min() > 0.5
+    found = calibrated(scene, tmp_path)
+    assert len(found.overlay_cells)
+    assert found.sources.tolist() == ["estimated"]
+    assert found.params[0, 0] / made.cameras[0].focal_px == pytest.approx(1.0, rel=0.02)
