@@ -140,6 +140,7 @@ class Georeference:
         return {
             "axes": "x east, y north, z up, metres",
             "origin_latitude_longitude_altitude": list(self.origin),
+            "rotation_from_adjustment": self.local_from_model.rotation.tolist(),
             "images_with_position": self.images,
             "inliers": self.inliers,
             "median_residual_m": self.median_residual_m,
@@ -177,22 +178,6 @@ def taking_order(names: Sequence[str]) -> Array:
         return natural_key(str(PurePosixPath(names[row]).parent)), natural_key(names[row])
 
     return np.array(sorted(range(len(names)), key=key), np.int64)
-
-
-def downward_axes(rotations: Array, orientations: Array) -> Array:
-    """What points down in photographs (N,3): the view direction plus the way to the lower side.
-
-    One of the two may be level, as in street-level and in nadir photographs, but not both.
-
-    Parameters
-    ----------
-    rotations : (N,3,3) cam_from_world, NaN where not registered.
-    orientations : (N,) EXIF orientations 1..8, which tell the lower side of the pixels as stored.
-    """
-    axes = np.where(orientations >= 5, 0, 1)
-    signs = np.where(np.isin(orientations, (3, 4, 7, 8)), -1.0, 1.0)
-    down: Array = rotations[:, 2] + signs[:, None] * rotations[np.arange(len(rotations)), axes]
-    return down
 
 
 def georeference(

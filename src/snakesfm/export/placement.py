@@ -10,12 +10,11 @@ from snakesfm.arrays import Array
 from snakesfm.export.georeference import (
     LEAST_IMAGES,
     Georeference,
-    downward_axes,
     georeference,
     taking_order,
 )
 from snakesfm.geometry.earth import local_origin
-from snakesfm.geometry.poses import center_of, has_pose, translation_of
+from snakesfm.geometry.poses import center_of, downward_axes, has_pose, translation_of
 
 NO_GPS = "no image of the model has GPS in EXIF"
 FEW_POSITIONS = f"only {{count}} images of the model have GPS in EXIF, and {LEAST_IMAGES} are needed"

@@ -57,3 +57,19 @@ def to_rigid3d(rotation: Array, translation: Array) -> "pycolmap.Rigid3d":
     from snakesfm.geometry.colmap_binding import pycolmap
 
     return pycolmap.Rigid3d(pycolmap.Rotation3d(np.asarray(rotation)), np.asarray(translation))
+
+
+def downward_axes(rotations: Array, orientations: Array) -> Array:
+    """What points down in photographs (N,3): the view direction plus the way to the lower side.
+
+    One of the two may be level, as in street-level and in nadir photographs, but not both.
+
+    Parameters
+    ----------
+    rotations : (N,3,3) cam_from_world, NaN where not registered.
+    orientations : (N,) EXIF orientations 1..8, which tell the lower side of the pixels as stored.
+    """
+    axes = np.where(orientations >= 5, 0, 1)
+    signs = np.where(np.isin(orientations, (3, 4, 7, 8)), -1.0, 1.0)
+    down: Array = rotations[:, 2] + signs[:, None] * rotations[np.arange(len(rotations)), axes]
+    return down

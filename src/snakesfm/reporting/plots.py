@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from snakesfm.arrays import Array
-from snakesfm.geometry.poses import center_of
+from snakesfm.geometry.poses import center_of, downward_axes
 
 MAP_PX = 560
 MARGIN = 0.05
@@ -20,6 +20,10 @@ MARK_PX = 11.0
 # more cameras have smaller marks, which would else hide the points
 FULL_SIZE_MARKS = 50
 HISTOGRAM_SIZE = (560, 180)
+# length of a mean of unit vectors that agree on a direction
+LEAST_AGREED = 0.5
+# times farther that cameras over or on flat ground spread along it than across
+FLAT_RATIO = 3.0
 
 
 def error_histogram(errors_px: Array, bins: int = 40) -> str:
@@ -53,27 +57,47 @@ def error_histogram(errors_px: Array, bins: int = 40) -> str:
     return f'<svg viewBox="0 0 {width} {height}" class="plot">{"".join(bars)}{"".join(ticks)}</svg>'
 
 
-def view_axes(rotations: Array, translations: Array) -> Array:
+def view_axes(rotations: Array, translations: Array, orientations: Array) -> Array:
     """Axes (3,3) of the maps as rows: east, north and up of a world of unknown orientation.
 
-    Up is the mean of the cameras' upward axes if they agree, else (cameras looking down from all sides)
-    the direction in which the centres spread least, on the side that the cameras look from.
+    Down is what points down in photographs, in the mean. Where all look the same way, it may as well be
+    their view direction (nadir) as their lower side (street level), or lie between (oblique); where it is
+    that of no photographs, cameras look up or down from all sides. The centres tell: they spread least.
 
     Parameters
     ----------
     rotations, translations : (n,3,3), (n,3) cam_from_world, finite, n >= 1.
+    orientations : (n,) EXIF orientations 1..8.
     """
-    up = -rotations[:, 1].mean(axis=0)
+    down = downward_axes(rotations, orientations).mean(axis=0)
+    forward = rotations[:, 2].mean(axis=0)
+    lower = down - forward
     centers = center_of(rotations, translations)
-    spread = np.linalg.svd(centers - centers.mean(axis=0), full_matrices=True)[2]
-    if np.linalg.norm(up) < 0.5:
-        up = spread[2] * (np.sign(-rotations[:, 2].mean(axis=0) @ spread[2]) or 1.0)
-    up = up / np.linalg.norm(up)
-    east = spread[0] - (spread[0] @ up) * up
+    offsets = centers - centers.mean(axis=0)
+    principal = np.linalg.eigh(offsets.T @ offsets)[1]
+    if np.linalg.norm(np.cross(forward, lower)) > LEAST_AGREED:
+        down = _down_of_one_view(forward, lower, offsets)
+    elif np.linalg.norm(down) < LEAST_AGREED:
+        down = principal[:, 0] * (np.sign(principal[:, 0] @ down) or 1.0)
+    up = -down / np.linalg.norm(down)
+    east = principal[:, 2] - (principal[:, 2] @ up) * up
     if np.linalg.norm(east) < 1e-6:
         east = np.cross(up, np.eye(3)[int(np.argmin(np.abs(up)))])
     east = east / np.linalg.norm(east)
     return np.array([east, np.cross(up, east), up])
+
+
+def _down_of_one_view(forward: Array, lower: Array, offsets: Array) -> Array:
+    """Down between the mean view direction and the mean lower side, where centres spread least.
+
+    Centres (n,3), from their mean, that spread about alike there are taken for those of a street.
+    """
+    plane = np.linalg.qr(np.column_stack([forward, lower]))[0]
+    squares, axes = np.linalg.eigh(plane.T @ offsets.T @ offsets @ plane)
+    if squares[1] <= FLAT_RATIO**2 * max(squares[0], 0.0):
+        return lower
+    least: Array = plane @ axes[:, 0]
+    return least * (np.sign(least @ (forward + lower)) or 1.0)
 
 
 def map_box(centers: Array, points: Array) -> tuple[Array, Array]:

@@ -6,9 +6,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from snakesfm.evaluation.alignment import project_to_so3
-from snakesfm.export.georeference import Georeference, downward_axes, georeference
+from snakesfm.export.georeference import Georeference, georeference
 from snakesfm.geometry.earth import local_origin
-from snakesfm.geometry.poses import Similarity
+from snakesfm.geometry.poses import Similarity, downward_axes
 
 ORIGIN = (47.0, 8.0, 500.0)
 # columns: the camera's axes right, down and forward, in metres east, north and up
