@@ -1,20 +1,17 @@
 """What a user should know of the cameras of an exported model, a sentence each."""
 
 from collections.abc import Collection, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from snakesfm.arrays import Array
 from snakesfm.bundle.focal_pairs import STRETCHED_MODELS
 from snakesfm.export.nerfstudio import camera_warnings
+from snakesfm.export.undistorted import FlatCamera
 from snakesfm.geometry.camera import Camera
 from snakesfm.geometry.lens_fit import MAX_MISFIT, fit_lenses
 from snakesfm.geometry.poses import to_camera
-
-if TYPE_CHECKING:
-    from snakesfm.arrays import Array
-    from snakesfm.artifacts import Reconstruction
-    from snakesfm.export.undistorted import FlatCamera
 
 OTHER_LENS = (
     "camera {camera} ({model}): reprojection errors grow with distance from the principal point, so this "
@@ -71,14 +68,21 @@ MOST_CROPPED = 0.05
 OBSERVATIONS_OF_LENSES = 500_000
 
 
-def adjusted_warnings(adjusted: "Reconstruction", cameras: Mapping[int, Camera]) -> list[str]:
-    """What other tools cannot do with cameras, given by rows, and what bundle adjustment could not."""
+def adjusted_warnings(
+    cameras: Mapping[int, Camera], resets: Array, offsets: Array, spreads: Array
+) -> list[str]:
+    """What other tools cannot do with cameras, given by rows, and what bundle adjustment could not.
+
+    Parameters
+    ----------
+    cameras : those in use, by their rows.
+    resets, offsets, spreads : (C,) what the adjustment says of all cameras, see its artifact.
+    """
     by_kind: dict[str, list[str]] = {}
     for row, camera in cameras.items():
         for kind, line in camera_warnings(camera, row + 1).items():
             by_kind.setdefault(kind, []).append(line)
     warnings = [line for lines in by_kind.values() for line in _some_cameras(lines)]
-    resets, offsets, spreads = adjusted.camera_resets, adjusted.camera_offsets, adjusted.camera_spreads
     warnings += _sentences(RESET_CAMERA, cameras, {row: resets[row] for row in cameras if resets[row]})
     for sentence, values in ((FAR_PRINCIPAL_POINT, offsets), (MIXED_FOCALS, spreads)):
         known = {row: values[row] for row in cameras if np.isfinite(values[row])}
@@ -103,15 +107,26 @@ def _some_cameras(lines: list[str]) -> list[str]:
 
 
 def lens_warnings(
-    model: "Reconstruction", cameras: Sequence[Camera], camera_ids: "Array", held: Collection[int]
+    cameras: Sequence[Camera],
+    camera_ids: Array,
+    rotations: Array,
+    translations: Array,
+    points: Array,
+    offsets: Array,
+    image_ids: Array,
+    keypoints: Array,
+    held: Collection[int],
 ) -> list[str]:
-    """A sentence per camera whose lens is not of its model; the parameters of those ``held`` were given."""
-    some = slice(None, None, -(-len(model.image_ids) // OBSERVATIONS_OF_LENSES) or 1)
-    images = model.image_ids[some]
-    points = model.points[np.repeat(np.arange(len(model.points)), np.diff(model.offsets))[some]]
-    in_camera = to_camera(model.rotations[images], model.translations[images], points)
+    """A sentence per camera whose lens is not of its model; the parameters of those ``held`` were given.
+
+    The others as of :func:`snakesfm.export.colmap.build_reconstruction`.
+    """
+    some = slice(None, None, -(-len(image_ids) // OBSERVATIONS_OF_LENSES) or 1)
+    images = image_ids[some]
+    observed = points[np.repeat(np.arange(len(points)), np.diff(offsets))[some]]
+    in_camera = to_camera(rotations[images], translations[images], observed)
     by_row = dict(enumerate(cameras))
-    fits = fit_lenses(by_row, camera_ids[images], images, in_camera, model.keypoints[some])
+    fits = fit_lenses(by_row, camera_ids[images], images, in_camera, keypoints[some])
     misfits = {row: fit.misfit for row, fit in fits.items() if fit.misfit > MAX_MISFIT}
     given = {row: misfit for row, misfit in misfits.items() if row in held}
     others = {row: misfit for row, misfit in misfits.items() if row not in held}
@@ -128,7 +143,7 @@ def stretched_warnings(cameras: Mapping[int, Camera], former: Sequence[str]) -> 
     return _sentences(STRETCHED, cameras, ratios)
 
 
-def flat_warnings(cameras: Mapping[int, Camera], flats: Mapping[int, "FlatCamera"]) -> list[str]:
+def flat_warnings(cameras: Mapping[int, Camera], flats: Mapping[int, FlatCamera]) -> list[str]:
     """A sentence per camera, given by its row, of whose pictures without distortion much is missing."""
     little = {row: flat.shown for row, flat in flats.items() if flat.shown < LEAST_UNDISTORTED}
     cropped = {row: flat.cropped for row, flat in flats.items() if flat.cropped > MOST_CROPPED}

@@ -125,10 +125,22 @@ def _warnings(
     """What a user should know of the model with the ``registered`` images (rows), a sentence each."""
     names = [str(name) for name in index.names]
     used = {row: cameras[row] for row in sorted({int(index.camera_ids[row]) for row in registered})}
-    warnings = adjusted_warnings(adjusted, used)
+    warnings = adjusted_warnings(
+        used, adjusted.camera_resets, adjusted.camera_offsets, adjusted.camera_spreads
+    )
     fixed = job.settings["intrinsics"] == "fixed"
     held = {row for row in used if fixed and index.camera_sources[row] == "given"}
-    warnings += lens_warnings(model, cameras, index.camera_ids, held)
+    warnings += lens_warnings(
+        cameras,
+        index.camera_ids,
+        model.rotations,
+        model.translations,
+        model.points,
+        model.offsets,
+        model.image_ids,
+        model.keypoints,
+        held,
+    )
     warnings += flat_warnings(used, flats)
     if len({camera.is_fisheye for camera in used.values()}) > 1:
         warnings.append(MIXED_LENSES)

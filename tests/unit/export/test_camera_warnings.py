@@ -102,19 +102,9 @@ def test_pictures_of_which_little_is_left_without_distortion_are_warned_of(
 def test_a_problem_of_many_cameras_is_told_of_some(monkeypatch, count: int, named: int) -> None:
     folding = Camera("SIMPLE_RADIAL", 640, 480, (300.0, 320.0, 240.0, -1.2))
     wide = Camera("FOV", 640, 480, (250.0, 250.0, 320.0, 240.0, 1.4))
-    adjusted = SimpleNamespace(
-        camera_resets=["distortion"] * count,
-        camera_offsets=np.full(count, 0.07),
-        camera_spreads=np.full(count, 0.1),
-    )
-    one = SimpleNamespace(
-        image_ids=np.zeros(1, int),
-        points=np.ones((1, 3)),
-        offsets=np.array([0, 1]),
-        rotations=np.eye(3)[None],
-        translations=np.zeros((1, 3)),
-        keypoints=np.zeros((1, 2)),
-    )
+    adjusted = (["distortion"] * count, np.full(count, 0.07), np.full(count, 0.1))
+    zero, pose = np.zeros(1, int), (np.eye(3)[None], np.zeros((1, 3)))
+    one = (zero, *pose, np.ones((1, 3)), np.array([0, 1]), zero, np.zeros((1, 2)))
     misfits = dict.fromkeys(range(count), SimpleNamespace(misfit=np.inf))
     monkeypatch.setattr(cameras, "fit_lenses", lambda *_: misfits)
     flat = SimpleNamespace(shown=0.1, cropped=0.2)
@@ -124,10 +114,8 @@ def test_a_problem_of_many_cameras_is_told_of_some(monkeypatch, count: int, name
             "reset and kept fixed",
             "max_principal_point_offset",
             "differ in focal length",
-        ): (cameras.adjusted_warnings(adjusted, dict.fromkeys(range(count), folding))),
-        ("does not describe the lens",): cameras.lens_warnings(
-            one, [folding] * count, np.zeros(1, int), ()
-        ),
+        ): cameras.adjusted_warnings(dict.fromkeys(range(count), folding), *adjusted),
+        ("does not describe the lens",): cameras.lens_warnings([folding] * count, *one, ()),
         ("undistorted/ shows only", "20% of the pixels were cut off"): cameras.flat_warnings(
             dict.fromkeys(range(count), wide), dict.fromkeys(range(count), flat)
         ),
