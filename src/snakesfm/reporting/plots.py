@@ -20,8 +20,10 @@ MARK_PX = 11.0
 # more cameras have smaller marks, which would else hide the points
 FULL_SIZE_MARKS = 50
 HISTOGRAM_SIZE = (560, 180)
-# length of a mean of unit vectors that agree on a direction
+# length of a mean of unit vectors that agree on a direction, and of a cross product of two such means that
+# leaves open what is between them
 LEAST_AGREED = 0.5
+LEAST_CROSSED = 0.1
 # times farther that cameras over or on flat ground spread along it than across
 FLAT_RATIO = 3.0
 
@@ -60,9 +62,9 @@ def error_histogram(errors_px: Array, bins: int = 40) -> str:
 def view_axes(rotations: Array, translations: Array, orientations: Array) -> Array:
     """Axes (3,3) of the maps as rows: east, north and up of a world of unknown orientation.
 
-    Down is what points down in photographs, in the mean. Where all look the same way, it may as well be
-    their view direction (nadir) as their lower side (street level), or lie between (oblique); where it is
-    that of no photographs, cameras look up or down from all sides. The centres tell: they spread least.
+    Down is what points down in photographs, in the mean. Where more look one way than the other, it may as
+    well be their view direction (nadir) as their lower side (street level), or lie between (oblique). The
+    centres tell: they spread least along it, as they do where the mean tells nothing.
 
     Parameters
     ----------
@@ -75,10 +77,13 @@ def view_axes(rotations: Array, translations: Array, orientations: Array) -> Arr
     centers = center_of(rotations, translations)
     offsets = centers - centers.mean(axis=0)
     principal = np.linalg.eigh(offsets.T @ offsets)[1]
-    if np.linalg.norm(np.cross(forward, lower)) > LEAST_AGREED:
-        down = _down_of_one_view(forward, lower, offsets)
-    elif np.linalg.norm(down) < LEAST_AGREED:
+    crossed = float(np.linalg.norm(np.cross(forward, lower)))
+    if np.linalg.norm(down) < LEAST_AGREED:
         down = principal[:, 0] * (np.sign(principal[:, 0] @ down) or 1.0)
+    elif crossed > LEAST_CROSSED:
+        # on no flat ground, the rule for photographs of one view that are level
+        usual = lower if crossed > LEAST_AGREED else down
+        down = _down_between(forward, lower, offsets, usual)
     up = -down / np.linalg.norm(down)
     east = principal[:, 2] - (principal[:, 2] @ up) * up
     if np.linalg.norm(east) < 1e-6:
@@ -87,15 +92,15 @@ def view_axes(rotations: Array, translations: Array, orientations: Array) -> Arr
     return np.array([east, np.cross(up, east), up])
 
 
-def _down_of_one_view(forward: Array, lower: Array, offsets: Array) -> Array:
-    """Down between the mean view direction and the mean lower side, where centres spread least.
+def _down_between(forward: Array, lower: Array, offsets: Array, usual: Array) -> Array:
+    """Down in the plane of the mean view direction and the mean lower side, where centres spread least.
 
-    Centres (n,3), from their mean, that spread about alike there are taken for those of a street.
+    It is the ``usual`` one if centres (n,3), from their mean, spread about alike in that plane.
     """
     plane = np.linalg.qr(np.column_stack([forward, lower]))[0]
     squares, axes = np.linalg.eigh(plane.T @ offsets.T @ offsets @ plane)
     if squares[1] <= FLAT_RATIO**2 * max(squares[0], 0.0):
-        return lower
+        return usual
     least: Array = plane @ axes[:, 0]
     return least * (np.sign(least @ (forward + lower)) or 1.0)
 

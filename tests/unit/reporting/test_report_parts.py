@@ -229,7 +229,10 @@ def test_up_of_photographs_that_exif_turns_is_that_of_what_they_show() -> None:
 
 @pytest.mark.parametrize("tilt_deg", [0.0, 45.0, 90.0])
 @pytest.mark.parametrize("columns", [1, 6])
-def test_up_of_photographs_of_one_heading_is_across_the_ground(tilt_deg: float, columns: int) -> None:
+@pytest.mark.parametrize("southward", [0, 3])
+def test_up_of_photographs_of_few_headings_is_across_the_ground(
+    tilt_deg: float, columns: int, southward: int
+) -> None:
     rng = np.random.default_rng(0)
     # flight lines or a street northwards at one height; cameras that look north are tilted downwards
     x, y = np.meshgrid(np.arange(columns) * 9.0, np.arange(8) * 9.0)
@@ -238,6 +241,8 @@ def test_up_of_photographs_of_one_heading_is_across_the_ground(tilt_deg: float, 
     forward = np.array([0.0, np.cos(tilt), -np.sin(tilt)])
     lower = np.array([0.0, -np.sin(tilt), -np.cos(tilt)])
     rotations = np.tile(np.array([[1.0, 0.0, 0.0], lower, forward]), (len(centers), 1, 1))
+    if southward:
+        rotations[::southward] = rotations[0] @ np.diag([-1.0, -1.0, 1.0])
     axes = view_axes(rotations, translation_of(rotations, centers), np.ones(len(centers), int))
     assert axes[2] == pytest.approx([0.0, 0.0, 1.0], abs=0.05)
 
