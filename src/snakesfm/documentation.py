@@ -83,8 +83,8 @@ With a reference model there are also:
 | `not_registered` | names of the images that are in no model |
 | `points`, `observations`, `mean_track_length`, `mean_reprojection_error_px` | of the largest model, in original pixels |
 | `warnings` | list of sentences |
-| `georeference` | null, or the place of the largest model: `axes`, `origin_latitude_longitude_altitude` (degrees and metres, WGS84), `images_with_position`, `inliers` (positions that agree with the model), `median_residual_m`, `median_horizontal_residual_m`, `median_vertical_residual_m`, `altitude_steps` |
-| `georeference_refused` | why the largest model has no place, if images have GPS or `georeference` is true; else null |
+| `georeference` | null, or the place of the largest model: `axes`, `origin_latitude_longitude_altitude` (degrees and metres, WGS84), `rotation_from_adjustment` (rows: east, north and up in the coordinate frame of `reconstruction.h5`), `images_with_position`, `inliers` (positions that agree with the model), `median_residual_m`, `median_horizontal_residual_m`, `median_vertical_residual_m`, `altitude_steps` |
+| `georeference_refused` | why the largest model has no place, if images have GPS or `georeference` is true; else null, as with `georeference: false` |
 | `georeference_of_models` | list: the same as `georeference` for each model |
 """
 

@@ -1,16 +1,20 @@
 """The files of an exported model, and the pictures beside them that no rule names."""
 
+import json
 import os
 from pathlib import Path
 
 SUMMARY = "summary.json"
+SPARSE_FILES = (
+    "cameras.bin",
+    "images.bin",
+    "points3D.bin",
+    "cameras.txt",
+    "images.txt",
+    "points3D.txt",
+)
 MODEL_FILES = (
-    "sparse/0/cameras.bin",
-    "sparse/0/images.bin",
-    "sparse/0/points3D.bin",
-    "sparse/0/cameras.txt",
-    "sparse/0/images.txt",
-    "sparse/0/points3D.txt",
+    *(f"sparse/0/{name}" for name in SPARSE_FILES),
     "points.ply",
     "transforms.json",
     SUMMARY,
@@ -18,9 +22,9 @@ MODEL_FILES = (
 
 
 def lacks_pictures(model: Path, link_images: bool, undistort: bool) -> bool:
-    """Whether pictures beside a model are lost, or links lead nowhere, as where a project moved.
+    """Whether pictures or models beside a model are lost, or links lead nowhere, as where a project moved.
 
-    Snakemake does not see it, for the names of the pictures are no outputs.
+    Snakemake does not see it, for they are no outputs. Pictures without distortion are only counted.
 
     Parameters
     ----------
@@ -30,7 +34,17 @@ def lacks_pictures(model: Path, link_images: bool, undistort: bool) -> bool:
     masks = model / "masks"
     if masks.is_symlink() and not masks.exists():
         return True
-    if undistort and not all((model / "undistorted" / part).is_dir() for part in ("images", "sparse")):
+    try:
+        summary = json.loads((model / SUMMARY).read_text("utf-8"))
+        pictures, others = summary["registered_images"], len(summary["images_in_other_models"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return True
+    models = [model / "sparse" / str(number + 1) for number in range(others)]
+    if undistort:
+        models.append(model / "undistorted" / "sparse" / "0")
+        if sum(len(files) for *_, files in os.walk(model / "undistorted" / "images")) < pictures:
+            return True
+    if not all((folder / name).is_file() for folder in models for name in SPARSE_FILES):
         return True
     return (link_images or undistort) and _leads_nowhere(model / "images")
 

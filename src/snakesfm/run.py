@@ -24,8 +24,8 @@ LOCK_NAME = ".snakesfm.lock"
 CONFIGURATION_NAME = ".snakesfm.config.json"
 MOST_SENTENCES = 10
 KILLED = "was killed from outside (out of memory, time limit, cancelled, or its node failed)"
-# what libjpeg and SQLite say before they end a process in which COLMAP writes images or a database
-FULL_SIGNS = ("out of disk space?", "database or disk is full")
+# what SQLite says before it ends a process in which COLMAP writes a database
+FULL_SIGN = "database or disk is full"
 LACKS_SPACE = "ended as the disk is full: free the disk, then run again"
 FEWER_JOBS = "; if memory ran out, with fewer jobs at once: --cores N or --resources mem_mb=MB"
 RELATIVE_AUC = re.compile(r"relative_pose_auc_(.+)deg")
@@ -294,7 +294,7 @@ class Run:
             if lines and lines[-1].startswith("error: "):
                 sentences.append(f"{lines[-1].removeprefix('error: ')} (log: {log})")
             elif not self.interrupted and (not lines or not find_cost(lines[-1])):
-                full = any(sign in line for line in lines for sign in FULL_SIGNS)
+                full = any(FULL_SIGN in line for line in lines)
                 reason = LACKS_SPACE if full else KILLED
                 sentences.append(f"{log.parent.name} {log.stem} {reason} (log: {log})")
         return sentences

@@ -45,6 +45,19 @@ def test_features_survive_the_round_trip_and_are_in_hlocs_convention(tmp_path, c
     assert read_hloc_features(file, "a") is None and read_hloc_features(file, "missing.jpg") is None
 
 
+def test_descriptors_of_whole_numbers_get_length_1(tmp_path, columns):
+    columns["descriptors"] = np.random.default_rng(1).integers(0, 256, (7, 128)).astype(np.uint8)
+    columns["descriptors"][3] = 0
+    with h5py.File(tmp_path / "features.h5", "w") as file:
+        write_hloc_features(file, "a.jpg", columns, (9, 9))
+    file = open_hloc(tmp_path / "features.h5")
+    lengths = np.linalg.norm(file["a.jpg"]["descriptors"][()].astype(np.float64), axis=0)
+    np.testing.assert_allclose(lengths, np.arange(7) != 3, atol=1e-3)
+    found = read_hloc_features(file, "a.jpg")["descriptors"]
+    norms = np.linalg.norm(columns["descriptors"].astype(float), axis=1, keepdims=True)
+    np.testing.assert_allclose(found, columns["descriptors"] / np.maximum(norms, 1.0), atol=1e-3)
+
+
 def test_half_precision_without_scores_or_descriptors_is_read(tmp_path):
     with h5py.File(tmp_path / "features.h5", "w") as file:
         file.create_group("x.jpg")["keypoints"] = np.array([[1, 2], [3, 4]], np.float16)

@@ -4,17 +4,21 @@ from pathlib import Path
 
 import pytest
 
-from snakesfm.model_files import lacks_pictures
+from snakesfm.artifacts import write_json
+from snakesfm.model_files import SPARSE_FILES, lacks_pictures
 
 
 @pytest.fixture
 def model(tmp_path: Path) -> Path:
-    """The folder of a model, with a link to the images."""
+    """The folder of a model of one image and beside another, with a link to the images."""
     (tmp_path / "images").mkdir()
     (tmp_path / "images" / "a.jpg").touch()
     folder = tmp_path / "scene" / "export_model"
-    folder.mkdir(parents=True)
+    (folder / "sparse" / "1").mkdir(parents=True)
+    for name in SPARSE_FILES:
+        (folder / "sparse" / "1" / name).touch()
     (folder / "images").symlink_to("../../images")
+    write_json(folder / "summary.json", {"registered_images": 1, "images_in_other_models": [5]})
     return folder
 
 
@@ -49,10 +53,20 @@ def test_links_to_single_images_and_masks_must_lead_somewhere(model: Path) -> No
     assert not lost(model)
 
 
-@pytest.mark.parametrize("part", ["images", "sparse"])
+@pytest.mark.parametrize("part", ["images/deep/a.jpg", "sparse/0/images.txt"])
 def test_undistorted_pictures_are_missed_where_they_are_wanted(model: Path, part: str) -> None:
-    for name in ("images", "sparse"):
-        (model / "undistorted" / name).mkdir(parents=True)
+    for name in ("images/deep/a.jpg", *(f"sparse/0/{name}" for name in SPARSE_FILES)):
+        (model / "undistorted" / name).parent.mkdir(parents=True, exist_ok=True)
+        (model / "undistorted" / name).touch()
     assert not lost(model, undistort=True)
-    (model / "undistorted" / part).rmdir()
+    (model / "undistorted" / part).unlink()
     assert lost(model, undistort=True) and not lost(model)
+
+
+def test_files_of_separate_models_and_a_summary_that_says_how_many_are_missed(model: Path) -> None:
+    (model / "sparse" / "1" / "points3D.bin").unlink()
+    assert lost(model)
+    (model / "sparse" / "1" / "points3D.bin").touch()
+    for content in ("", "[]", "{}"):
+        (model / "summary.json").write_text(content)
+        assert lost(model)

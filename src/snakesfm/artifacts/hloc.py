@@ -235,10 +235,15 @@ def write_hloc_features(
     """Add an image's features; the arguments are those that :func:`read_hloc_features` returns.
 
     Keypoints stay float32, as float16 would put them a pixel off in large images; readers take either.
+    Descriptors of whole numbers, as of SIFT, get length 1, which hloc's matchers and thresholds assume.
     """
+    descriptors = columns["descriptors"]
+    if descriptors.dtype.kind in "iu":
+        descriptors = descriptors.astype(np.float32)
+        descriptors /= np.maximum(np.linalg.norm(descriptors, axis=1, keepdims=True), 1.0)
     group = file.create_group(name)
     group["keypoints"] = columns["keypoints"].astype(np.float32) - CENTER_SHIFT
-    group["descriptors"] = columns["descriptors"].T.astype(np.float16)
+    group["descriptors"] = descriptors.T.astype(np.float16)
     group["scores"] = columns["scores"].astype(np.float32)
     group["scales"] = columns["scales"].astype(np.float32)
     group["oris"] = np.rad2deg(columns["angles"]).astype(np.float32)

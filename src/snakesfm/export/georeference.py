@@ -10,7 +10,7 @@ import numpy as np
 from snakesfm.arrays import Array
 from snakesfm.geometry.colmap_binding import pycolmap
 from snakesfm.geometry.earth import Origin, local_metres
-from snakesfm.geometry.poses import Similarity
+from snakesfm.geometry.poses import Similarity, lower_sides
 from snakesfm.geometry.robust import robust_sigma
 from snakesfm.image_names import natural_key
 
@@ -140,6 +140,7 @@ class Georeference:
         return {
             "axes": "x east, y north, z up, metres",
             "origin_latitude_longitude_altitude": list(self.origin),
+            "rotation_from_adjustment": self.local_from_model.rotation.tolist(),
             "images_with_position": self.images,
             "inliers": self.inliers,
             "median_residual_m": self.median_residual_m,
@@ -186,12 +187,9 @@ def downward_axes(rotations: Array, orientations: Array) -> Array:
 
     Parameters
     ----------
-    rotations : (N,3,3) cam_from_world, NaN where not registered.
-    orientations : (N,) EXIF orientations 1..8, which tell the lower side of the pixels as stored.
+    rotations, orientations : see :func:`snakesfm.geometry.poses.lower_sides`.
     """
-    axes = np.where(orientations >= 5, 0, 1)
-    signs = np.where(np.isin(orientations, (3, 4, 7, 8)), -1.0, 1.0)
-    down: Array = rotations[:, 2] + signs[:, None] * rotations[np.arange(len(rotations)), axes]
+    down: Array = rotations[:, 2] + lower_sides(rotations, orientations)
     return down
 
 

@@ -1,11 +1,14 @@
-"""The folder ``images`` next to an exported model."""
+"""The folders ``images`` and ``masks`` next to an exported model."""
 
 import os
 import shutil
 import struct
 import zlib
-from collections.abc import Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
+from io import BytesIO
 from pathlib import Path
+
+import numpy as np
 
 from snakesfm.arrays import Array
 
@@ -20,38 +23,61 @@ VALUE_FORMATS = {3: "H", 4: "I"}
 def place_images(target: Path, images: Path, names: Sequence[str], orientations: Array) -> None:
     """Make ``target`` show the images as the model sees them.
 
-    It is one link to ``images``, relative where both lie under one top folder, so that they can be moved
-    together; a copy where links cannot be made. If EXIF turns some images, it is a folder of links with
-    copies of those that EXIF does not turn: the model is of the pixels as they are stored, which is what
-    COLMAP, 3DGS and nerfstudio read, but OpenCV and others would turn them.
+    If EXIF turns some images, copies of them are placed that EXIF does not turn: the model is of the pixels
+    as they are stored, which is what COLMAP, 3DGS and nerfstudio read, but OpenCV and others would turn
+    them.
 
     Parameters
     ----------
     target : what to make; an earlier one is replaced.
     images : folder of the photographs.
-    names : images relative to it; the files that are placed where one link does not do.
+    names : images relative to it.
     orientations : (N,) EXIF orientation of each image.
     """
-    # the folder of the photographs may be given as the very link that is made here
-    images = images.resolve()
+    turned = [
+        name for name, value in zip(names, orientations.tolist(), strict=True) if value not in UPRIGHT
+    ]
+    _place(target, images, names, dict.fromkeys(turned, _write_unturned))
+
+
+def place_masks(target: Path, masks: Path, names: Collection[str]) -> None:
+    """Make ``target`` show masks as nerfstudio can read them: as they are, or else copies of 0 and 255.
+
+    Parameters
+    ----------
+    target : what to make; an earlier one is replaced.
+    masks : folder of the masks.
+    names : masks relative to it.
+    """
+    plain = all(_is_plain_gray(masks / name) for name in names)
+    _place(target, masks, names, {} if plain else dict.fromkeys(names, _write_gray))
+
+
+def _place(
+    target: Path, source: Path, names: Collection[str], writers: Mapping[str, Callable[[Path, Path], None]]
+) -> None:
+    """Make ``target`` one link to ``source``, or a folder of links if some files have ``writers``.
+
+    Links are relative where both lie under one top folder, so that they can be moved together; where none
+    can be made, files are copied.
+    """
+    # the source may be given as the very link that is made here
+    source = source.resolve()
     if target.is_symlink() or target.is_file():
         target.unlink()
-    elif target.is_dir() and target.resolve() == images:
+    elif target.is_dir() and target.resolve() == source:
         return
     elif target.is_dir():
         shutil.rmtree(target)
-    turned = {
-        name for name, value in zip(names, orientations.tolist(), strict=True) if value not in UPRIGHT
-    }
-    if not turned and _link(target, images):
+    if not writers and _link(target, source):
         return
     for name in names:
         place = target / name
         place.parent.mkdir(parents=True, exist_ok=True)
-        if name in turned:
-            _write_unturned(images / name, place)
-        elif not _link(place, images / name):
-            shutil.copyfile(images / name, place)
+        if name in writers:
+            writers[name](source / name, place)
+        elif not _link(place, source / name):
+            shutil.copyfile(source / name, place)
 
 
 def _link(link: Path, source: Path) -> bool:
@@ -64,6 +90,28 @@ def _link(link: Path, source: Path) -> bool:
     except OSError:
         return False
     return True
+
+
+def _is_plain_gray(mask: Path) -> bool:
+    """Whether nerfstudio reads a mask as snakesfm does.
+
+    It refuses colours, takes the numbers of a palette for gray, and some versions misread other depths.
+    """
+    from PIL import Image
+
+    with Image.open(mask) as image:
+        return image.mode == "L" and not image.has_transparency_data
+
+
+def _write_gray(source: Path, place: Path) -> None:
+    """Write a mask of 0 and 255 in 8 bits."""
+    from PIL import Image
+
+    from snakesfm.ingest.read import read_not_black
+
+    content = BytesIO()
+    Image.fromarray(np.where(read_not_black(source), 255, 0).astype(np.uint8)).save(content, "PNG")
+    place.write_bytes(content.getvalue())
 
 
 def _write_unturned(source: Path, place: Path) -> None:

@@ -1,6 +1,7 @@
 """A model as nerfstudio's transforms.json."""
 
 from collections.abc import Mapping, Sequence
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -26,6 +27,7 @@ def transforms(
     translations: Array,
     registered: Array,
     masks: Mapping[str, str],
+    is_placed: bool = False,
 ) -> dict[str, Any]:
     """The content of transforms.json.
 
@@ -41,6 +43,7 @@ def transforms(
     registered : rows of the images that have a pose.
     masks : of each image by its name, as paths relative to ``masks/``; empty for none, as nerfstudio takes
         one for every image or no one.
+    is_placed : whether z is up, so that nerfstudio is not to turn the world by the cameras' upper sides.
     """
     used = sorted({int(camera_ids[row]) for row in registered})
     intrinsics = {row: camera_intrinsics(cameras[row]) for row in used}
@@ -63,6 +66,8 @@ def transforms(
     content["frames"] = frames
     content["applied_transform"] = np.eye(4)[:3].tolist()
     content["ply_file_path"] = "points.ply"
+    if is_placed:
+        content["orientation_override"] = "none"
     return content
 
 
@@ -159,10 +164,12 @@ def _rays_of_grid(camera: Camera) -> tuple[Array, Array, Array]:
     return pixels, rays, np.linalg.norm(again - pixels, axis=1) < ROUND_TRIP_PX
 
 
+@cache
 def _fit_terms(camera: Camera) -> tuple[float, list[float], float] | None:
     """Focal scale and distortion terms fitted over a grid of pixels, and the largest error in pixels.
 
     Pixels that lie outside the lens have no say; None where too few are left, or a fit makes no lens.
+    Kept, as both the intrinsics and the warnings are of it.
     """
     pixels, rays, held = _rays_of_grid(camera)
     if held.sum() < LEAST_PIXELS:

@@ -1,10 +1,12 @@
-"""Images without distortion, and the model and the masks that belong to them."""
+"""Images without distortion, and the cameras and masks that belong to them."""
 
-import os
 import shutil
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
-from functools import partial
+from dataclasses import dataclass
+from io import BytesIO
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
@@ -13,29 +15,132 @@ from snakesfm.arrays import Array
 from snakesfm.errors import ImageError
 from snakesfm.geometry.camera import Camera
 from snakesfm.geometry.colmap_binding import pycolmap
-from snakesfm.geometry.colmap_checks import check_binary
-from snakesfm.geometry.colmap_files import lack_of_space
 from snakesfm.ingest.masks import find_mask, read_mask
 
-JPEG_SUFFIXES = (".jpg", ".jpeg")
+if TYPE_CHECKING:
+    from PIL.Image import Image
+
 # COLMAP takes less for none, and it moves no pixel by a thousandth
 LEAST_DISTORTION = 1e-7
-PINHOLE_PARAMETERS = 4
-JPEG_END = b"\xff\xd9"
+# of a principal point from the middle, in pixels
+MOST_OFF_MIDDLE = 0.5
 GRID = 50
+JPEG_FORMATS = ("JPEG", "MPO")
+# that PIL writes
+MOST_EXIF_BYTES = 65533
+# of JPEG, as COLMAP's, and for how long PIL looks for a smaller WebP
+JPEG_QUALITY, WEBP_EFFORT = 100, 95
 
 
-def write_undistorted(target: Path, sparse: Path, images: Path, masks: Path | None, threads: int) -> None:
-    """Write ``target``/images and ``target``/sparse/0 with PINHOLE cameras, for tools that know no other.
+@dataclass(frozen=True)
+class FlatCamera:
+    """A camera's picture without distortion, cropped so that the principal point is in its middle.
 
-    Images and masks of perspective cameras without distortion keep their size and every pixel.
+    Inria's 3DGS takes it to be there, whatever the model says.
+
+    Parameters
+    ----------
+    lens : of the image as it is stored; PINHOLE if it has no distortion.
+    camera : PINHOLE, of the cropped picture.
+    left, top : columns and rows that are cut off before it.
+    cropped : share of the pixels of the picture without distortion that are cut off.
+    shown : share of the image that the picture without distortion holds.
+    """
+
+    lens: Camera
+    camera: Camera
+    left: int
+    top: int
+    cropped: float
+    shown: float
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether the image as it is stored is the picture."""
+        return self.lens.model == "PINHOLE" and not self.cropped
+
+    def move(self, keypoints: Array) -> Array:
+        """Pixels (N,2) of the stored image in the picture, NaN where it holds none."""
+        fx, fy, cx, cy = self.camera.params
+        moved: Array = self.lens.normalize(keypoints) * (fx, fy) + (cx, cy)
+        return moved
+
+    def show(self, pixels: Array, nearest: bool = False) -> Array:
+        """The picture (H,W) or (H,W,3) uint8 of a stored image, of four pixels or the ``nearest``."""
+        if self.lens.model != "PINHOLE":
+            options = pycolmap.UndistortCameraOptions()
+            if nearest:
+                interpolations = type(options.warp_options.interpolation)
+                options.warp_options.interpolation = interpolations.NEAREST_NEIGHBOR
+            stored = pycolmap.Bitmap.from_array(pixels)
+            pixels = pycolmap.undistort_image(options, stored, self.lens.to_pycolmap())[0].to_array()
+        rows = slice(self.top, self.top + self.camera.height)
+        return pixels[rows, self.left : self.left + self.camera.width]
+
+
+def flatten(camera: Camera) -> FlatCamera:
+    """The picture of a camera without distortion.
+
+    COLMAP makes it as large as the edges tell. Where a lens sees more than 180 degrees, they have no rays,
+    and the picture may become a thumbnail.
+    """
+    lens = _true_lens(camera)
+    whole = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), lens.to_pycolmap())
+    left, width = _middle_part(whole.principal_point_x, whole.width)
+    top, height = _middle_part(whole.principal_point_y, whole.height)
+    focals = (whole.focal_length_x, whole.focal_length_y)
+    params = (*focals, whole.principal_point_x - left, whole.principal_point_y - top)
+    cropped = 1.0 - width * height / (whole.width * whole.height)
+    return FlatCamera(
+        lens, Camera("PINHOLE", width, height, params), left, top, cropped, _share(lens, whole)
+    )
+
+
+def _true_lens(camera: Camera) -> Camera:
+    """A camera whose distortion is all 0, which COLMAP leaves as it is, as PINHOLE or a true fisheye."""
+    source = camera.to_pycolmap()
+    if not source.is_undistorted():
+        return camera
+    matrix = source.calibration_matrix()
+    pinhole = (matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2])
+    if source.is_perspective_fisheye():
+        terms = (LEAST_DISTORTION, 0.0, 0.0, 0.0)
+        return Camera("OPENCV_FISHEYE", camera.width, camera.height, pinhole + terms)
+    return Camera("PINHOLE", camera.width, camera.height, pinhole)
+
+
+def _middle_part(principal: float, size: int) -> tuple[int, int]:
+    """Start and length of the longest part of a side that has the principal point in its middle."""
+    if abs(principal - size / 2) <= MOST_OFF_MIDDLE:
+        return 0, size
+    # of a camera that looks past its picture, next to nothing
+    length = max(1, round(2 * min(principal, size - principal)))
+    return (0 if principal < size / 2 else size - length), length
+
+
+def _share(lens: Camera, whole: pycolmap.Camera) -> float:
+    """The share of a lens's image that is in its ``whole`` picture without distortion."""
+    if lens.model == "PINHOLE":
+        return 1.0
+    columns, rows = np.meshgrid(
+        (np.arange(GRID) + 0.5) * lens.width / GRID, (np.arange(GRID) + 0.5) * lens.height / GRID
+    )
+    rays = lens.normalize(np.column_stack([columns.ravel(), rows.ravel()]))
+    pixels = np.asarray(whole.img_from_cam(np.column_stack([rays, np.ones(len(rays))])))
+    return float(((pixels >= 0) & (pixels <= [whole.width, whole.height])).all(axis=1).mean())
+
+
+def write_undistorted(
+    target: Path, images: Path, masks: Path | None, cameras: Mapping[str, FlatCamera], threads: int
+) -> None:
+    """Write the pictures to ``target``/images, and their masks to ``target``/masks, named as in COLMAP.
 
     Parameters
     ----------
     target : folder to make.
-    sparse : folder of the COLMAP model.
-    images : folder of the images as they are stored, by the model's names.
-    masks : folder of masks, which go to ``target``/masks, named as in COLMAP; None without.
+    images : folder of the images as they are stored.
+    masks : folder of masks; None without.
+    cameras : of each image, by its name.
     threads : how many images to work on at once.
 
     Raises
@@ -44,143 +149,72 @@ def write_undistorted(target: Path, sparse: Path, images: Path, masks: Path | No
     ConfigError : a mask cannot be used.
     OSError : the disk is full.
     """
-    model = pycolmap.Reconstruction(str(sparse))
-    registered = [model.images[image_id] for image_id in model.reg_image_ids()]
+
+    def write(name: str) -> None:
+        camera = cameras[name]
+        _check_size(images / name, camera.lens)
+        _write_image(images / name, target / "images" / name, camera)
+        mask = None if masks is None else find_mask(masks, name)
+        if mask is not None:
+            _write_mask(mask, target / "masks" / f"{name}.png", camera)
+
     with ThreadPoolExecutor(threads) as pool:
-        list(pool.map(partial(_check_size, images, model), registered))
-    for camera in model.cameras.values():
-        _replace_undistorted(camera)
-    distorted = target / "distorted"
-    distorted.mkdir(parents=True)
-    model.write_binary(str(distorted))
-    check_binary(distorted, model)
-    jpegs = [image.name for image in registered if image.name.lower().endswith(JPEG_SUFFIXES)]
-    # of no names COLMAP takes all
-    names = jpegs or [image.name for image in registered[:1]]
-    pycolmap.undistort_images(str(target), str(distorted), str(images), names, num_threads=threads)
-    shutil.rmtree(distorted)
-    with ThreadPoolExecutor(threads) as pool:
-        list(pool.map(partial(_write_other, target / "images", images, model), registered))
-        if masks is not None:
-            list(pool.map(partial(_write_mask, target / "masks", masks, model), registered))
-    flat = target / "sparse"
-    check_binary(flat, model, PINHOLE_PARAMETERS)
-    inner = target / "model"
-    flat.rename(inner)
-    flat.mkdir()
-    inner.rename(flat / "0")
-    shutil.rmtree(target / "stereo")
-    for script in target.glob("run-colmap-*.sh"):
-        script.unlink()
+        list(pool.map(write, cameras))
 
 
-def undistorted_share(camera: Camera) -> float:
-    """The share of a camera's picture that is left of it without distortion.
-
-    COLMAP makes it as large as the edges tell. Where a lens sees more than 180 degrees, they have no rays,
-    and the picture may become a thumbnail.
-    """
-    source = camera.to_pycolmap()
-    _replace_undistorted(source)
-    if source.model_name == "PINHOLE":
-        return 1.0
-    flat = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), source)
-    columns, rows = np.meshgrid(
-        (np.arange(GRID) + 0.5) * camera.width / GRID, (np.arange(GRID) + 0.5) * camera.height / GRID
-    )
-    rays = camera.normalize(np.column_stack([columns.ravel(), rows.ravel()]))
-    pixels = np.asarray(flat.img_from_cam(np.column_stack([rays, np.ones(len(rays))])))
-    return float(((pixels >= 0) & (pixels <= [flat.width, flat.height])).all(axis=1).mean())
-
-
-def _replace_undistorted(camera: "pycolmap.Camera") -> None:
-    """Make a camera whose distortion is all 0, which COLMAP leaves as it is, PINHOLE or a true fisheye."""
-    if not camera.is_undistorted():
-        return
-    matrix = camera.calibration_matrix()
-    pinhole = [matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]]
-    if camera.is_perspective_fisheye():
-        camera.model = pycolmap.CameraModelId.OPENCV_FISHEYE
-        camera.params = [*pinhole, LEAST_DISTORTION, 0.0, 0.0, 0.0]
-    else:
-        camera.model = pycolmap.CameraModelId.PINHOLE
-        camera.params = pinhole
-
-
-def _check_size(images: Path, model: "pycolmap.Reconstruction", image: "pycolmap.Image") -> None:
-    """Refuse an image of another size than its camera, which would end COLMAP without a word."""
+def _check_size(image: Path, lens: Camera) -> None:
+    """Refuse an image of another size than its camera."""
     from snakesfm.ingest.read import read_header
 
-    header, camera = read_header(images / image.name), model.cameras[image.camera_id]
-    if (header.width, header.height) != (camera.width, camera.height):
+    header = read_header(image)
+    if (header.width, header.height) != (lens.width, lens.height):
         raise ImageError(
-            f"{images / image.name} has {header.width} x {header.height} pixels, but its camera "
-            f"{camera.width} x {camera.height}: restore the image that the model was made from."
+            f"{image} has {header.width} x {header.height} pixels, but its camera "
+            f"{lens.width} x {lens.height}: restore the image that the model was made from."
         )
 
 
-def _write_other(
-    target: Path, images: Path, model: "pycolmap.Reconstruction", image: "pycolmap.Image"
-) -> None:
-    """Write what is no JPEG, whatever its name says, from the pixels that keypoints were found in.
-
-    COLMAP reads no WebP, makes 12 bits in a file of 16 dark, and writes some TIFF files as none can read.
-    """
-    file = target / image.name
-    if image.name.lower().endswith(JPEG_SUFFIXES) and file.is_file():
-        _check_end(file, images / image.name)
-        return
-    # most jobs need no more than JPEG
+def _write_image(source: Path, place: Path, camera: FlatCamera) -> None:
+    """Write the picture of an image, from the pixels that keypoints were found in."""
     from PIL import Image
 
     from snakesfm.ingest.read import read_image
 
-    options = pycolmap.UndistortCameraOptions()
-    camera = model.cameras[image.camera_id]
-    pixels = _undistort(read_image(images / image.name).rgb, camera, options)
-    file.parent.mkdir(parents=True, exist_ok=True)
-    Image.fromarray(pixels).save(file, lossless=True, quality=95)
-
-
-def _check_end(jpeg: Path, source: Path) -> None:
-    """Refuse a JPEG whose end COLMAP had no room for."""
-    size = jpeg.stat().st_size
-    # what needs no warp is copied, and cameras may append to a JPEG what they like
-    if size == source.stat().st_size:
+    place.parent.mkdir(parents=True, exist_ok=True)
+    with Image.open(source) as opened:
+        # of other formats, some tools read no WebP, and 12 bits in a file of 16 as dark
+        is_copied = camera.is_whole and opened.format in JPEG_FORMATS
+        options = _kept(opened)
+    if is_copied:
+        shutil.copyfile(source, place)
         return
-    with jpeg.open("rb") as file:
-        file.seek(-min(len(JPEG_END), size), os.SEEK_END)
-        if file.read() != JPEG_END:
-            raise lack_of_space(jpeg.parent)
+    kind = Image.registered_extensions()[place.suffix.lower()]
+    options["quality"] = JPEG_QUALITY if kind == "JPEG" else WEBP_EFFORT
+    content = BytesIO()
+    Image.fromarray(camera.show(read_image(source).rgb)).save(content, kind, lossless=True, **options)
+    # by Python, which tells a full disk
+    place.write_bytes(content.getvalue())
 
 
-def _write_mask(
-    target: Path, masks: Path, model: "pycolmap.Reconstruction", image: "pycolmap.Image"
-) -> None:
-    """Undistort the mask of an image that has one, as the image is."""
-    mask = find_mask(masks, image.name)
-    if mask is None:
-        return
-    options = pycolmap.UndistortCameraOptions()
-    # a mask knows no gray
-    nearest = type(options.warp_options.interpolation).NEAREST_NEIGHBOR
-    options.warp_options.interpolation = nearest
-    camera = model.cameras[image.camera_id]
-    size = camera.width, camera.height
-    shown = 255 * read_mask(mask, size).astype(np.uint8)
-    shown = cv2.resize(shown, size, interpolation=cv2.INTER_NEAREST)
-    file = target / f"{image.name}.png"
-    file.parent.mkdir(parents=True, exist_ok=True)
-    if not pycolmap.Bitmap.from_array(_undistort(shown, camera, options)).write(str(file)):
-        raise lack_of_space(file.parent)
+def _kept(image: "Image") -> dict[str, Any]:
+    """What the picture of a JPEG image keeps of it: EXIF, colour profile, how finely it samples colours."""
+    from PIL import JpegImagePlugin
+
+    if image.format not in JPEG_FORMATS:
+        return {}
+    kept: dict[str, Any] = {"subsampling": JpegImagePlugin.get_sampling(image)}
+    exif = image.info.get("exif", b"")
+    if len(exif) <= MOST_EXIF_BYTES:
+        kept["exif"] = exif
+    if image.mode == "RGB":
+        kept["icc_profile"] = image.info.get("icc_profile")
+    return kept
 
 
-def _undistort(
-    pixels: Array, camera: "pycolmap.Camera", options: "pycolmap.UndistortCameraOptions"
-) -> Array:
-    """Pixels (H,W) or (H,W,3) uint8 without the camera's distortion; themselves of a PINHOLE camera."""
-    if camera.model_name == "PINHOLE":
-        return pixels
-    bitmap, _ = pycolmap.undistort_image(options, pycolmap.Bitmap.from_array(pixels), camera)
-    undistorted: Array = bitmap.to_array()
-    return undistorted
+def _write_mask(source: Path, place: Path, camera: FlatCamera) -> None:
+    """Write a mask as the picture of its image is; it knows no gray."""
+    size = camera.lens.width, camera.lens.height
+    wanted = 255 * read_mask(source, size).astype(np.uint8)
+    wanted = cv2.resize(wanted, size, interpolation=cv2.INTER_NEAREST)
+    place.parent.mkdir(parents=True, exist_ok=True)
+    place.write_bytes(cv2.imencode(".png", camera.show(wanted, nearest=True))[1].tobytes())

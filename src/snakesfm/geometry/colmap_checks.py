@@ -27,14 +27,8 @@ PLY_HEAD_END = b"end_header\n"
 CHUNK_BYTES = 1 << 24
 
 
-def check_binary(folder: Path, model: pycolmap.Reconstruction, parameters: int | None = None) -> None:
+def check_binary(folder: Path, model: pycolmap.Reconstruction) -> None:
     """Refuse binary files of a model that are shorter than what they hold.
-
-    Parameters
-    ----------
-    folder : where the model was written.
-    model : what was written.
-    parameters : number of parameters of each camera, where it is not that of ``model``.
 
     Raises
     ------
@@ -42,7 +36,7 @@ def check_binary(folder: Path, model: pycolmap.Reconstruction, parameters: int |
     """
     # COLMAP writes images and frames that have a pose, but all cameras and rigs
     images = [model.image(key) for key in model.reg_image_ids()]
-    counts = [parameters or len(camera.params) for camera in model.cameras.values()]
+    counts = [len(camera.params) for camera in model.cameras.values()]
     # of an image its name, the zero at the name's end, and the number of its keypoints
     heads = sum(IMAGE.size + len(os.fsencode(image.name)) + 1 + COUNT.size for image in images)
     sizes = {

@@ -57,3 +57,17 @@ def to_rigid3d(rotation: Array, translation: Array) -> "pycolmap.Rigid3d":
     from snakesfm.geometry.colmap_binding import pycolmap
 
     return pycolmap.Rigid3d(pycolmap.Rotation3d(np.asarray(rotation)), np.asarray(translation))
+
+
+def lower_sides(rotations: Array, orientations: Array) -> Array:
+    """Directions in the world (N,3) of the lower sides of photographs.
+
+    Parameters
+    ----------
+    rotations : (N,3,3) cam_from_world, NaN where not registered.
+    orientations : (N,) EXIF orientations 1..8, which tell the lower side of the pixels as stored.
+    """
+    axes = np.where(orientations >= 5, 0, 1)
+    signs = np.where(np.isin(orientations, (3, 4, 7, 8)), -1.0, 1.0)
+    lower: Array = signs[:, None] * rotations[np.arange(len(rotations)), axes]
+    return lower

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from snakesfm.arrays import Array
-from snakesfm.geometry.poses import center_of
+from snakesfm.geometry.poses import center_of, lower_sides
 
 MAP_PX = 560
 MARGIN = 0.05
@@ -20,6 +20,8 @@ MARK_PX = 11.0
 # more cameras have smaller marks, which would else hide the points
 FULL_SIZE_MARKS = 50
 HISTOGRAM_SIZE = (560, 180)
+# length of a mean of unit vectors that agree on a direction
+LEAST_AGREED = 0.5
 
 
 def error_histogram(errors_px: Array, bins: int = 40) -> str:
@@ -53,22 +55,23 @@ def error_histogram(errors_px: Array, bins: int = 40) -> str:
     return f'<svg viewBox="0 0 {width} {height}" class="plot">{"".join(bars)}{"".join(ticks)}</svg>'
 
 
-def view_axes(rotations: Array, translations: Array) -> Array:
+def view_axes(rotations: Array, translations: Array, orientations: Array) -> Array:
     """Axes (3,3) of the maps as rows: east, north and up of a world of unknown orientation.
 
-    Up is the mean of the cameras' upward axes if they agree, else (cameras looking down from all sides)
-    the direction in which the centres spread least, on the side that the cameras look from.
+    Down is the mean of the photographs' lower sides if they agree, else (cameras looking down from all sides)
+    the direction in which the centres spread least, on the side that the cameras look to.
 
     Parameters
     ----------
     rotations, translations : (n,3,3), (n,3) cam_from_world, finite, n >= 1.
+    orientations : (n,) EXIF orientations 1..8.
     """
-    up = -rotations[:, 1].mean(axis=0)
+    down = lower_sides(rotations, orientations).mean(axis=0)
     centers = center_of(rotations, translations)
     spread = np.linalg.svd(centers - centers.mean(axis=0), full_matrices=True)[2]
-    if np.linalg.norm(up) < 0.5:
-        up = spread[2] * (np.sign(-rotations[:, 2].mean(axis=0) @ spread[2]) or 1.0)
-    up = up / np.linalg.norm(up)
+    if np.linalg.norm(down) < LEAST_AGREED:
+        down = spread[2] * (np.sign(rotations[:, 2].mean(axis=0) @ spread[2]) or 1.0)
+    up = -down / np.linalg.norm(down)
     east = spread[0] - (spread[0] @ up) * up
     if np.linalg.norm(east) < 1e-6:
         east = np.cross(up, np.eye(3)[int(np.argmin(np.abs(up)))])

@@ -70,7 +70,8 @@ def run(job: StageJob) -> None:
         path.replace(job.output)
     print(
         f"export_database: {len(index.names)} images, {len(cameras)} cameras, "
-        f"{matched} pairs with matches, {accepted} with a two-view geometry",
+        f"{matched} pairs with matches, {accepted} with a two-view geometry; for COLMAP "
+        f"{pycolmap.__version__} or newer",
         flush=True,
     )
 

@@ -99,7 +99,7 @@ def run(job: StageJob) -> None:
         lead=_lead(metrics),
         software=f"snakesfm {snakesfm.__version__}",
         warnings=summary.get("warnings", []),
-        maps=_maps(names, model, registered),
+        maps=_maps(names, model, registered, index.orientations, summary.get("georeference")),
         stage_heads=["stage", "result", *(["seconds", "peak MB"] if seconds else [])],
         stages=_stage_rows(
             index, calibrated, pairs, graph, rotations, tracks, points, model, counts, seconds
@@ -192,13 +192,26 @@ def _lead(metrics: Mapping[str, Any]) -> str:
     return text + "."
 
 
-def _maps(names: Sequence[str], model: Reconstruction, registered: Array) -> list[tuple[str, str]]:
+def _maps(
+    names: Sequence[str],
+    model: Reconstruction,
+    registered: Array,
+    orientations: Array,
+    place: Mapping[str, Any] | None,
+) -> list[tuple[str, str]]:
+    """Captions and pictures of the model, with north where it is known from the ``place`` on the earth."""
     if len(registered) == 0:
         return []
     rotations, translations = model.rotations[registered], model.translations[registered]
-    axes = view_axes(rotations, translations)
+    if place:
+        axes = np.array(place["rotation_from_adjustment"])
+    else:
+        axes = view_axes(rotations, translations, orientations[registered])
     content = ([names[row] for row in registered], rotations, translations, model.points, model.colors)
-    views = {"From above": axes, "From the side": np.array([axes[0], axes[2], -axes[1]])}
+    views = {
+        "From above, north at the top" if place else "From above": axes,
+        "From the side": np.array([axes[0], axes[2], -axes[1]]),
+    }
     maps = []
     for caption, view in views.items():
         picture, outside = scene_map(*content, view)

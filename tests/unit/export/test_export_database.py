@@ -179,6 +179,11 @@ def test_cameras_and_images_come_with_trivial_rigs_and_frames(database) -> None:
         ]
 
 
+def test_the_last_line_names_the_version_of_colmap(tmp_path, problem, capsys) -> None:
+    export_database.run(job_of(tmp_path, write_inputs(tmp_path, problem)))
+    assert capsys.readouterr().out.endswith(f"; for COLMAP {pycolmap.__version__} or newer\n")
+
+
 def test_gps_is_a_pose_prior(database) -> None:
     (prior,) = database.read_all_pose_priors()
     np.testing.assert_array_equal(prior.position, GPS[2])

@@ -10,6 +10,7 @@ from finished_model import COUNT, LOST, export, gps_of, report
 
 from snakesfm.evaluation.colmap_model import read_model
 from snakesfm.geometry.earth import local_metres, local_origin
+from snakesfm.stages import render_report
 
 
 def test_a_model_with_positions_in_exif_is_in_metres_and_the_same_in_all_files(tmp_path, problem) -> None:
@@ -21,8 +22,9 @@ def test_a_model_with_positions_in_exif_is_in_metres_and_the_same_in_all_files(t
     model = read_model(folder / "sparse" / "0")
     origin = summary["origin_latitude_longitude_altitude"]
     local = pycolmap.GPSTransform().ellipsoid_to_enu(gps, *origin)
-    frames = json.loads((folder / "transforms.json").read_text())["frames"]
-    for frame in frames:
+    content = json.loads((folder / "transforms.json").read_text())
+    assert content["orientation_override"] == "none"
+    for frame in content["frames"]:
         image = model.images[frame["colmap_im_id"]]
         center = image.projection_center()
         np.testing.assert_allclose(np.array(frame["transform_matrix"])[:3, 3], center, atol=1e-9)
@@ -46,6 +48,7 @@ def test_the_world_stays_where_positions_contradict_it_or_are_not_wanted(tmp_pat
         assert (folder / "sparse/0/images.bin").read_bytes() == without
         assert json.loads((folder / "summary.json").read_text())["georeference"] is None
     for unused in (plain, folder):
+        assert "orientation_override" not in (unused / "transforms.json").read_text()
         summary = json.loads((unused / "summary.json").read_text())
         assert summary["georeference_refused"] is None
         assert not any("georeference" in line for line in summary["warnings"])
@@ -168,4 +171,18 @@ def test_the_report_says_where_the_model_is(tmp_path, problem) -> None:
         residual = summary["georeference"][f"median_{kind}residual_m"]
         assert 0.05 < residual < 2.0
         assert f"{residual:.4g}" in page
-    assert "<h2>Georeference</h2>" not in report(tmp_path / "none", problem, "")
+    without = report(tmp_path / "none", problem, "")
+    assert "<h2>Georeference</h2>" not in without
+    assert ("From above, north at the top" in page, "north at the top" in without) == (True, False)
+
+
+def test_the_report_is_drawn_along_east_and_north(tmp_path, problem, monkeypatch) -> None:
+    folder = export(tmp_path, problem, gps=gps_of(problem, 0.1))
+    summary = json.loads((folder / "summary.json").read_text())
+    drawn = []
+    monkeypatch.setattr(render_report, "scene_map", lambda *given: (drawn.append(given[-1]), ("", 0))[1])
+    report(tmp_path, problem, "", summary=summary)
+    # of gps_of: east, north and up in the model
+    expected = [[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]
+    np.testing.assert_allclose(drawn[0], expected, atol=0.01)
+    np.testing.assert_allclose(drawn[1], [expected[0], expected[2], np.negative(expected[1])], atol=0.01)

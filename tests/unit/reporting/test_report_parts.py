@@ -200,7 +200,7 @@ def test_up_is_that_of_the_cameras_in_any_world() -> None:
     rotations = look_at(centers, np.zeros((12, 3)), np.array([0.0, 0.0, 1.0]))
     turn = exp_so3(np.array([0.5, -1.0, 2.0]))
     turned, moved = rotations @ turn.T, centers @ turn.T
-    axes = view_axes(turned, translation_of(turned, moved))
+    axes = view_axes(turned, translation_of(turned, moved), np.ones(12, int))
     assert axes[2] == pytest.approx(turn @ [0.0, 0.0, 1.0], abs=1e-6)
     assert axes @ axes.T == pytest.approx(np.eye(3), abs=1e-9)
     assert np.linalg.det(axes) == pytest.approx(1.0)
@@ -213,8 +213,18 @@ def test_up_of_cameras_that_look_down_from_all_sides_is_against_their_view() -> 
     # the same centres, from which they look down or up
     for look, up in ((np.diag([1.0, -1, -1]), 1.0), (np.eye(3), -1.0)):
         rotations = np.array([turn @ look for turn in turns])
-        axes = view_axes(rotations, translation_of(rotations, centers))
+        axes = view_axes(rotations, translation_of(rotations, centers), np.ones(8, int))
         assert axes[2] == pytest.approx([0.0, 0.0, up], abs=0.01)
+
+
+def test_up_of_photographs_that_exif_turns_is_that_of_what_they_show() -> None:
+    angles = np.linspace(0, 2 * np.pi, 12, endpoint=False)
+    centers = np.column_stack([5 * np.cos(angles), 5 * np.sin(angles), np.zeros(12)])
+    upright = look_at(centers, np.zeros((12, 3)), np.array([0.0, 0.0, 1.0]))
+    # a phone that is held upright stores its pixels lying on their side
+    stored = np.stack([upright[:, 1], -upright[:, 0], upright[:, 2]], axis=1)
+    axes = view_axes(stored, translation_of(stored, centers), np.full(12, 6))
+    assert axes[2] == pytest.approx([0.0, 0.0, 1.0], abs=1e-6)
 
 
 def test_the_map_is_seen_from_above_with_the_first_axis_to_the_right() -> None:
@@ -246,9 +256,8 @@ def test_the_map_shows_cameras_and_points(count) -> None:
     rotations, translations = problem.rotations[:count], problem.translations[:count]
     names = [f"<{k}>" for k in range(count)]
     colors = np.full(problem.points.shape, (250, 10, 20), np.uint8)
-    svg, outside = scene_map(
-        names, rotations, translations, problem.points, colors, view_axes(rotations, translations)
-    )
+    axes = view_axes(rotations, translations, np.ones(count, int))
+    svg, outside = scene_map(names, rotations, translations, problem.points, colors, axes)
     assert (svg.count("<path"), outside) == (count, 0)
     assert "&lt;0&gt;" in svg
     data = re.search(r"base64,([^\"]+)", svg)
@@ -261,7 +270,7 @@ def test_the_map_shows_cameras_and_points(count) -> None:
 
 def test_the_map_of_a_model_without_points_has_its_cameras() -> None:
     problem = make_problem(camera_count=5, point_count=100)
-    axes = view_axes(problem.rotations, problem.translations)
+    axes = view_axes(problem.rotations, problem.translations, np.ones(5, int))
     nothing = np.zeros((0, 3))
     svg, outside = scene_map(
         list("abcde"), problem.rotations, problem.translations, nothing, nothing.astype(np.uint8), axes
