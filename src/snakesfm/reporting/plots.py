@@ -58,7 +58,7 @@ def error_histogram(errors_px: Array, bins: int = 40) -> str:
 def view_axes(rotations: Array, translations: Array, orientations: Array) -> Array:
     """Axes (3,3) of the maps as rows: east, north and up of a world of unknown orientation.
 
-    Down is the mean of the photographs' lower sides if they agree, else (cameras looking down from all sides)
+    Down is the mean of the photographs' lower sides if they agree, else (cameras looking down all around)
     the direction in which the centres spread least, on the side that the cameras look to.
 
     Parameters
