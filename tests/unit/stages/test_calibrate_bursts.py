@@ -5,9 +5,10 @@ from itertools import combinations
 
 import numpy as np
 import pytest
-from synthetic_scene import HEADER, write_scene
+from plain_artifacts import write_plain_matches
+from synthetic_scene import write_scene
 
-from snakesfm.artifacts import CalibratedCameras, PairMatches
+from snakesfm.artifacts import CalibratedCameras
 from snakesfm.config.calibrate_cameras import CalibrateCamerasOptions
 from snakesfm.stages import calibrate_cameras
 from snakesfm.stages.job import StageJob
@@ -68,13 +69,8 @@ def test_pairs_of_one_place_do_not_take_the_place_of_those_that_tell(
         monkeypatch.setattr(calibrate_cameras, "MOVED_PX", moved_px)
     made, copies = burst(count)
     inputs = write_scene(copies, tmp_path)
-    PairMatches(
-        copies.pairs.astype(np.int32),
-        np.full(len(copies.pairs), "", dtype=object),
-        copies.match_offsets,
-        copies.matches.astype(np.int32),
-        np.ones(len(copies.matches), np.float32),
-    ).write(tmp_path / "matches.h5", HEADER)
+    of_pair = np.split(copies.matches, copies.match_offsets[1:-1])
+    write_plain_matches(tmp_path / "matches.h5", copies.pairs, of_pair)
     inputs = {name: inputs[name] for name in ("index", "features")} | {"matches": tmp_path / "matches.h5"}
     job = StageJob(
         "calibrate_cameras", "scene", inputs, (tmp_path / "out.h5",), CalibrateCamerasOptions(), threads=1
