@@ -54,7 +54,7 @@ check: setup
 	$(BIN)/snakemake --profile profiles/local --quiet --dry-run --config images=demo/images output=results
 
 test: check deep surface cluster
-	$(BIN)/python -m pytest --numprocesses 2 --dist loadfile --no-loadscope-reorder
+	SNAKESFM_TEST_EXTRAS=1 $(BIN)/python -m pytest --numprocesses 2 --dist loadfile --no-loadscope-reorder
 
 clean:
 	rm -rf .venv results demo .snakemake

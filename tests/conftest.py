@@ -1,6 +1,5 @@
 """Fixtures shared by all tests."""
 
-import importlib
 import importlib.metadata
 from pathlib import Path
 from types import ModuleType
@@ -8,6 +7,7 @@ from types import ModuleType
 import hypothesis
 import one_thread  # noqa: F401  before anything loads numpy
 import pytest
+from extras import import_extra
 from workflow_runner import Outcome, Workflow
 
 from snakesfm.learned.fetch import fetch_weights
@@ -73,16 +73,16 @@ def finished(small_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> tup
 def open3d() -> ModuleType:
     """The package that surfaces need; tests of them are skipped where it cannot be loaded."""
     try:
-        return importlib.import_module("open3d")
-    except (ImportError, Warning):
-        pytest.skip("the extra 'surface' is not installed, or libraries that open3d needs are missing")
+        return import_extra("open3d", "surface")
+    except (ImportError, Warning) as error:
+        pytest.skip(f"libraries that open3d needs are missing: {error}")
 
 
 @pytest.fixture(scope="session")
 def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with the weights that packages hold; tests of networks skip where torch or these are absent."""
-    pytest.importorskip("torch", reason="the extra 'deep' is not installed")
-    pytest.importorskip("kornia", reason="the extra 'deep' is not installed")
+    import_extra("torch")
+    import_extra("kornia")
     for package in PACKAGES_WITH_WEIGHTS:
         try:
             importlib.metadata.distribution(package.partition("==")[0])

@@ -8,15 +8,13 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 from PIL import Image
+from plain_artifacts import write_plain_cameras, write_plain_index, write_plain_tracks
 
 from snakesfm.artifacts import (
-    CalibratedCameras,
     CameraRotations,
     Header,
-    ImageIndex,
     LocalFeatures,
     Reconstruction,
-    TrackTable,
     TriangulatedPoints,
     TwoViewGeometries,
     ViewGraph,
@@ -54,33 +52,23 @@ def write_index(
     folder: Path, orientations: np.ndarray | None = None, gps: np.ndarray | None = None
 ) -> Path:
     folder.mkdir(parents=True, exist_ok=True)
-    models, sizes, params, sources = cameras_to_columns([CAMERA, CAMERA])
-    ImageIndex(
-        names=NAMES,
-        sizes=np.tile([640, 480], (COUNT, 1)),
-        sha256=["0"] * COUNT,
-        blocks=np.zeros(COUNT, np.int32),
+    write_plain_index(
+        folder / "index.h5",
+        NAMES,
+        [(640, 480)] * COUNT,
+        [CAMERA, CAMERA],
         camera_ids=np.arange(COUNT) % 2,
-        orientations=np.ones(COUNT, np.int32) if orientations is None else orientations,
-        focal_exif_px=np.full(COUNT, np.nan),
-        gps=np.full((COUNT, 3), np.nan) if gps is None else gps,
-        duplicate_of=np.full(COUNT, -1),
-        camera_models=models,
-        camera_sizes=sizes,
-        camera_params=params,
-        camera_sources=sources,
         refused_names=["no <image>.jpg"],
         refused_reasons=["It is a text file."],
         warnings=["5 images have a camera each."],
-    ).write(folder / "index.h5", HEADER)
+        orientations=orientations,
+        gps=gps,
+    )
     return folder / "index.h5"
 
 
 def write_cameras(folder: Path, focal_sigma: tuple[float, float] = (0.0, 0.0)) -> Path:
-    models, sizes, params, sources = cameras_to_columns([CAMERA, CAMERA])
-    CalibratedCameras(
-        models, sizes, params, sources, focal_sigma, np.zeros(2, int), np.zeros((0, 4), int), [OVERLAY]
-    ).write(folder / "cameras.h5", HEADER)
+    write_plain_cameras(folder / "cameras.h5", [CAMERA, CAMERA], focal_sigma, [OVERLAY])
     return folder / "cameras.h5"
 
 
@@ -272,23 +260,13 @@ def write_former_stages(folder: Path, problem: SyntheticProblem) -> dict[str, ob
         labels=np.where(np.arange(kept.sum()) == 0, 2, 0),
         components=np.where(np.arange(COUNT) == LOST, -1, 0),
     ).write(folder / "rotations.h5", HEADER)
-    keypoints = problem.track_keypoints
-    TrackTable(
-        offsets=problem.track_offsets,
-        image_ids=problem.track_image_ids,
-        keypoint_ids=problem.track_keypoint_ids,
-        part_ids=np.repeat(np.arange(len(problem.track_offsets) - 1), np.diff(problem.track_offsets)),
-        keypoints=keypoints,
-        colors=np.zeros((len(keypoints), 3), np.uint8),
-        lengths_unmerged=np.zeros(0, np.int64),
-        lengths_merged=np.zeros(0, np.int64),
-    ).write(folder / "tracks.h5", HEADER)
+    write_plain_tracks(folder / "tracks.h5", problem)
     TriangulatedPoints(
         points=problem.points,
         offsets=problem.track_offsets,
         image_ids=problem.track_image_ids,
         keypoint_ids=problem.track_keypoint_ids,
-        keypoints=keypoints,
+        keypoints=problem.track_keypoints,
         colors=np.zeros((len(problem.points), 3), np.uint8),
     ).write(folder / "points.h5", HEADER)
     log = folder / "logs" / "match_pairs" / "0-0.log"

@@ -2,14 +2,15 @@
 
 import cv2
 import numpy as np
+from plain_artifacts import write_plain_index
 
-from snakesfm.artifacts import Header, ImageIndex, ImagePairs, LocalFeatures, PairMatches
+from snakesfm.artifacts import ImagePairs, LocalFeatures, PairMatches
 from snakesfm.blocks import deal_blocks
 from snakesfm.config.describe_images import DescribeImagesOptions
 from snakesfm.config.extract_features import ExtractFeaturesOptions
 from snakesfm.config.learn_vocabulary import LearnVocabularyOptions
 from snakesfm.config.match_pairs import MatchPairsOptions
-from snakesfm.geometry.camera import PARAM_SLOTS
+from snakesfm.geometry.camera import Camera
 from snakesfm.ingest.discover import digest_images
 from snakesfm.stages import describe_images, extract_features, learn_vocabulary, match_pairs, select_pairs
 from snakesfm.stages.job import StageJob
@@ -35,26 +36,18 @@ class Scene:
 
     def __init__(self, folder, images, blocks, gps=None, copies=()):
         self.folder, self.images, self.blocks = folder, images, blocks
-        count = len(NAMES)
-        index = ImageIndex(
-            names=NAMES,
-            sizes=np.tile([320, 240], (count, 1)),
+        write_plain_index(
+            self.file("index"),
+            NAMES,
+            [(320, 240)] * len(NAMES),
+            [Camera("PINHOLE", 320, 240, ())],
             sha256=list(digest_images(images, NAMES).values()),
             blocks=deal_blocks(NAMES, blocks),
-            camera_ids=np.zeros(count, int),
-            orientations=np.ones(count, int),
-            focal_exif_px=np.full(count, np.nan),
-            gps=np.full((count, 3), np.nan) if gps is None else gps,
-            duplicate_of=[0 if row in copies else -1 for row in range(count)],
-            camera_models=["PINHOLE"],
-            camera_sizes=[[320, 240]],
-            camera_params=np.full((1, PARAM_SLOTS), np.nan),
-            camera_sources=["given"],
+            duplicate_of=[0 if row in copies else -1 for row in range(len(NAMES))],
             refused_names=["bad.jpg"],
             refused_reasons=["bad.jpg is cut off."],
-            warnings=[],
+            gps=gps,
         )
-        index.write(self.file("index"), Header("index_images", 1, "scene"))
 
     def file(self, name):
         return self.folder / f"{name}.h5"

@@ -3,60 +3,30 @@
 from dataclasses import replace
 
 import numpy as np
+from plain_artifacts import HEADER, write_plain_cameras, write_plain_index
 
-from snakesfm.artifacts import (
-    CalibratedCameras,
-    Header,
-    ImageIndex,
-    LocalFeatures,
-    TwoViewGeometries,
-    ViewGraph,
-)
+from snakesfm.artifacts import LocalFeatures, TwoViewGeometries, ViewGraph
 from snakesfm.bundle.completion import correspondence_graph
 from snakesfm.bundle.interface import SolverSettings
 from snakesfm.bundle.model import BundleModel, from_reconstruction, to_reconstruction
 from snakesfm.bundle.round_settings import RoundSettings
 from snakesfm.bundle.rounds import adjust_rounds
 from snakesfm.config.adjust_bundle import AdjustBundleOptions
-from snakesfm.geometry.camera import cameras_to_columns
 from snakesfm.view_graph.components import label_components
 
-HEADER = Header("test", 1, "scene")
 STAGES_AFTER = ("rotations", "centers", "tracks", "points", "reconstruction")
 
 
 def write_scene(made, folder):
     """Write all up to the view graph; the paths of these and of what the stages after it write, by name."""
     count, edges = made.image_count, len(made.pairs)
-    models, sizes, params, sources = cameras_to_columns(made.cameras)
-    ImageIndex(
-        names=[f"{i}.jpg" for i in range(count)],
-        sizes=np.tile(sizes[:1], (count, 1)),
-        sha256=[""] * count,
-        blocks=np.arange(count) % 2,
-        camera_ids=made.camera_ids,
-        orientations=np.ones(count, int),
-        focal_exif_px=np.full(count, np.nan),
-        gps=np.full((count, 3), np.nan),
-        duplicate_of=np.full(count, -1),
-        camera_models=models,
-        camera_sizes=sizes,
-        camera_params=params,
-        camera_sources=sources,
-        refused_names=[],
-        refused_reasons=[],
-        warnings=[],
-    ).write(folder / "index.h5", HEADER)
-    CalibratedCameras(
-        models,
-        sizes,
-        params,
-        sources,
-        np.full(len(models), np.nan),
-        np.zeros(len(models), int),
-        np.zeros((0, 4), int),
-        [],
-    ).write(folder / "cameras.h5", HEADER)
+    names = [f"{i}.jpg" for i in range(count)]
+    sizes = [(made.cameras[0].width, made.cameras[0].height)] * count
+    blocks = np.arange(count) % 2
+    write_plain_index(
+        folder / "index.h5", names, sizes, made.cameras, camera_ids=made.camera_ids, blocks=blocks
+    )
+    write_plain_cameras(folder / "cameras.h5", made.cameras)
     ViewGraph(
         pairs=made.pairs,
         rotations=made.edge_rotations,
@@ -151,7 +121,7 @@ def side_by_side(first, second):
 
 
 def write_features(made, folder, blocks=2):
-    """Features in blocks; the red of an image says its block."""
+    """Features in blocks; red says the block of a keypoint's image, green the image, blue the keypoint."""
     paths = []
     for block in range(blocks):
         ids = np.arange(made.image_count)[block::blocks]
@@ -169,10 +139,16 @@ def write_features(made, folder, blocks=2):
             scores=np.ones(count, np.float32),
             scales=np.ones(count, np.float32),
             angles=np.zeros(count, np.float32),
-            colors=np.full((count, 3), 7 + block, np.uint8),
+            colors=np.concatenate([colors_of(made, i, 7 + block) for i in ids]),
         ).write(path, HEADER)
         paths.append(path)
     return paths
+
+
+def colors_of(made, image, red):
+    """Colours (N,3) of an image's keypoints, of which hardly two are the same."""
+    rows = np.arange(len(made.keypoints[image]))
+    return np.column_stack(np.broadcast_arrays(red, 10 * image, rows % 256)).astype(np.uint8)
 
 
 def write_geometries(made, folder):
@@ -194,8 +170,8 @@ def write_geometries(made, folder):
             inlier_counts=np.array([len(p) for p in parts]),
             inlier_ratios=np.ones(len(rows)),
             triangulation_angles_deg=made.edge_angles_deg[rows],
-            offsets=np.r_[0, np.cumsum([len(p) for p in parts])],
-            inliers=np.concatenate(parts),
+            offsets=np.cumsum([0, *map(len, parts)]),
+            inliers=np.concatenate([made.matches[:0], *parts]),
         ).write(path, HEADER)
         paths.append(path)
     return paths

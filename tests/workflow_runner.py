@@ -1,6 +1,7 @@
 """Runs the workflow as a user does, in a folder of the test's own."""
 
 import dataclasses
+import json
 import os
 import re
 import shutil
@@ -75,6 +76,14 @@ class Workflow:
                 timeout,
             )
             return Outcome(status, Path(log.name).read_text("utf-8"))
+
+    def metrics_of(self, scene: Path, *options: str, timeout: float = 300) -> dict:
+        """Reconstruct a scene with a reference, and compare the two."""
+        outcome = self.run(*config_of(scene, *options), timeout=timeout)
+        assert outcome.status == 0, outcome.text
+        return json.loads(
+            (self.folder / "out" / scene.name / "evaluate_model" / "metrics.json").read_text()
+        )
 
     def start(self, *arguments: str, cores: int = 2) -> "subprocess.Popen[str]":
         """Start a run whose output can be read when it has ended."""

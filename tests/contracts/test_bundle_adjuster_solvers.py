@@ -112,6 +112,14 @@ class BundleAdjusterContract:
         assert abs(camera.params[3]) < 1e-4
         assert 1.0 < abs(camera.params[0] - 510.0) < 50.0
 
+    def test_held_focal_length_stays(self, adjust):
+        start = Camera("SIMPLE_RADIAL", 640, 480, (510.0, 320.0, 240.0, 0.0))
+        _, model, reconstruction = scene(start=start)
+        adjust(reconstruction, SolverSettings(refine_focal=False))
+        (camera,) = from_reconstruction(reconstruction, model)[0].cameras
+        assert abs(camera.params[0] - 510.0) < 0.1
+        assert 0.01 < abs(camera.params[3]) < 0.2
+
     def test_one_image_or_no_point_is_left_alone(self, adjust):
         made, model, _ = scene()
         alone = to_reconstruction(

@@ -5,6 +5,7 @@ from typing import ClassVar
 import numpy as np
 import pytest
 from contracts.test_detectors import shapes
+from extras import import_extra
 
 from snakesfm.evaluation.colmap_model import read_model
 from snakesfm.features.virtual import VirtualKeypoints
@@ -69,8 +70,8 @@ class TestLoftr(DetectorFreeContract):
 
     @pytest.fixture
     def matcher(self):
-        torch = pytest.importorskip("torch", reason="the extra 'deep' is not installed")
-        pytest.importorskip("kornia", reason="the extra 'deep' is not installed")
+        torch = import_extra("torch")
+        import_extra("kornia")
         if not self.made:
             torch.manual_seed(1)
             self.made["loftr"] = DETECTOR_FREE_MATCHERS["loftr"](

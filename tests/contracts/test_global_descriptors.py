@@ -4,6 +4,7 @@ import cv2
 import numpy as np
 import pytest
 from contracts.test_detectors import shapes
+from extras import import_extra
 from random_weights import megaloc_state, write_netvlad
 
 from snakesfm.errors import ConfigError
@@ -30,8 +31,8 @@ class GlobalDescriptorContract:
 
     @pytest.fixture
     def state(self, tmp_path):
-        pytest.importorskip("torch", reason="the extra 'deep' is not installed")
-        pytest.importorskip("transformers", reason="the extra 'deep' is not installed")
+        import_extra("torch")
+        import_extra("transformers")
         self.write(tmp_path / WEIGHT_FILES[self.method].name)
         return read_checkpoint(self.method, tmp_path, "fetch")
 

@@ -6,6 +6,7 @@ from typing import ClassVar
 import numpy as np
 import pytest
 from contracts.test_detectors import DetectorContract, extract, shapes
+from extras import import_extra
 
 from snakesfm.errors import ConfigError
 from snakesfm.features.extraction import DETECTORS, extract_keypoints
@@ -113,7 +114,7 @@ class TestSuperpointOfRandomWeights(DetectorContract):
 
     @pytest.fixture
     def detector(self):
-        pytest.importorskip("transformers", reason="the extra 'deep' is not installed")
+        import_extra("transformers")
         if not self.made:
             import torch
 

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from contracts.test_detectors import extract, shapes
 from contracts.test_matchers import MatcherContract, check_matches
+from extras import import_extra
 
 from snakesfm.errors import ConfigError
 from snakesfm.features.extraction import DETECTORS
@@ -108,7 +109,7 @@ class SuperpointMatcherContract(MatcherContract):
 
     @pytest.fixture
     def matcher(self):
-        pytest.importorskip("transformers", reason="the extra 'deep' is not installed")
+        import_extra("transformers")
         if self.method not in self.made:
             import torch
 

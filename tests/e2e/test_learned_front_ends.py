@@ -1,6 +1,5 @@
 """Networks with their real weights on real photographs, from images to evaluated model, at a small size."""
 
-import json
 from pathlib import Path
 
 import pytest
@@ -21,12 +20,9 @@ def test_a_front_end_reconstructs_photographs(
     data: Path, weights: Path, workflow: Workflow, front_end: str, least: tuple
 ) -> None:
     folder = data / "strecha_entry_p10"
-    outcome = workflow.run(
-        "--config",
-        f"images={folder / 'images'}",
-        f"reference={folder / 'reference'}",
+    metrics = workflow.metrics_of(
+        folder,
         f"cameras={folder / 'reference'}",
-        "output=out",
         # each job with a network loads torch
         "blocks=1",
         f"front_end={front_end}",
@@ -35,9 +31,6 @@ def test_a_front_end_reconstructs_photographs(
         "select_pairs={method: sequential, look_ahead: 3}",
         timeout=900,
     )
-    assert outcome.status == 0, outcome.text
-    path = workflow.folder / "out" / folder.name / "evaluate_model" / "metrics.json"
-    metrics = json.loads(path.read_text())
     assert metrics["reference_images_registered"] == 10
     for degrees, bound in zip((1, 3, 5), least, strict=True):
         assert bound <= metrics[f"relative_pose_auc_{degrees}deg"] < 99

@@ -60,6 +60,7 @@ def plan_of(tmp_path: Path, **config: object) -> Plan:
             r"pairs=.*select_pairs\.method 'exhaustive' does not read it: .*'listed' or remove pairs=",
         ),
         ({"intrinsics": "refine"}, r"intrinsics=refine.*set cameras=PATH or remove intrinsics="),
+        ({"select_pairs": {"method": "listed"}}, r"'listed', but .* has no list of pairs: set pairs=FILE"),
     ],
 )
 def test_keys_that_would_do_nothing_are_refused(
@@ -108,6 +109,9 @@ def test_one_scene_may_lack_what_another_has(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("key", "path", "message"),
     [
+        ("cameras", "nowhere.txt", "does not exist: correct the path"),
+        ("reference", "nowhere", "does not exist: correct the path"),
+        ("pairs", "hloc", "is not a file: give a text file"),
         ("cameras", "photos/0.jpg", "is neither a COLMAP cameras file nor a 3x3 matrix"),
         ("cameras", "photos", r"contains none of cameras\.bin, cameras\.txt, K\.txt"),
         ("cameras", "pairs.txt", "is neither a COLMAP cameras file nor a 3x3 matrix"),
@@ -122,6 +126,12 @@ def test_a_path_of_another_kind_is_refused(key: str, path: str, message: str, tm
     with pytest.raises(ConfigError, match=f"given as {key}= for scene 'photos', {message}") as refused:
         plan_of(tmp_path, **{key: path})
     assert "\n" not in str(refused.value)
+
+
+def test_results_may_not_lie_among_the_images(tmp_path: Path) -> None:
+    images = str(tmp_path / "photos")
+    with pytest.raises(ConfigError, match=r"photos/out' is inside the image folder .*another output=DIR"):
+        plan_of(tmp_path, output=f"{images}/out")
 
 
 def test_results_are_of_the_folder_that_was_indexed(tmp_path: Path) -> None:

@@ -37,22 +37,10 @@ def texture(seed: int) -> Image.Image:
     ("config", "parts"),
     [
         (["images=nowhere"], ["nowhere", "does not exist", "images=PATH"]),
-        (["images=empty"], ["empty", "contains no"]),
         (["images=empty", "imagse=x"], ["imagse", "did you mean 'images'"]),
-        (["images=empty", "match_pairs={max_ratioo: 1}"], ["match_pairs.max_ratioo", "max_ratio"]),
-        (["images=empty", "blocks=0"], ["blocks"]),
-        (["images=photos", "cameras=nowhere.txt"], ["nowhere.txt", "cameras="]),
-        (["images=photos", "reference=nowhere"], ["nowhere", "reference="]),
-        (["images=photos", "reference=photos"], ["'photos', given as reference=", "a COLMAP model"]),
-        (["images=photos", "cameras=photos"], ["'photos', given as cameras=", "cameras.txt"]),
         (["images="], ["'images' has no value"]),
-        (["images=photos", "intrinsics=refine"], ["set cameras=PATH"]),
-        (["images=photos", "output=photos/out"], ["photos/out", "inside the image folder"]),
-        (["images=photos", "scene=a/b"], ["a/b", "scene=NAME"]),
         (["images=photos", "output=."], ["its own image folder 'photos'", "scene=NAME"]),
         (["images=100_0042"], ["images=100_0042 as the number 1000042", "images=./100_0042"]),
-        (["images=photos", "select_pairs={method: listed}"], ["pairs="]),
-        (["images=photos", "select_pairs={method: listed}", "pairs=empty"], ["empty", "is not a file"]),
     ],
 )
 def test_a_wrong_call_gives_one_sentence(

@@ -9,6 +9,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+from extras import import_extra
 from random_weights import megaloc_state, write_netvlad
 from workflow_runner import ROOT, Workflow, config_of, copy_run
 
@@ -33,16 +34,8 @@ pytestmark = pytest.mark.workflow
 DEGREES = ("1", "2.5", "5", "10", "20")
 
 
-def run(workflow: Workflow, scene: Path, *config: str) -> dict:
-    outcome = workflow.run(
-        "--config", f"images={scene / 'images'}", f"reference={scene / 'reference'}", "output=out", *config
-    )
-    assert outcome.status == 0, outcome.text
-    return json.loads((workflow.folder / "out" / "square" / "evaluate_model" / "metrics.json").read_text())
-
-
 def test_the_oracle_leaves_no_error_to_the_back_end(small_scene: Path, workflow: Workflow) -> None:
-    metrics = run(workflow, small_scene, "front_end=virtual", f"cameras={small_scene / 'reference'}")
+    metrics = workflow.metrics_of(small_scene, "front_end=virtual", f"cameras={small_scene / 'reference'}")
     for degrees in DEGREES:
         assert 99.5 <= metrics[f"pose_auc_{degrees}deg"] <= 100
     assert metrics["reference_images_registered"] == 16
@@ -51,8 +44,7 @@ def test_the_oracle_leaves_no_error_to_the_back_end(small_scene: Path, workflow:
 
 def test_hlocs_files_go_out_and_come_in_again(finished, small_scene: Path, workflow: Workflow) -> None:
     copy_run(finished[0], workflow.folder)
-    config = [f"images={small_scene / 'images'}", f"reference={small_scene / 'reference'}", "output=out"]
-    outcome = workflow.run("hloc", "--config", *config, "export_hloc={matches: putative}")
+    outcome = workflow.run("hloc", *config_of(small_scene, "export_hloc={matches: putative}"))
     assert outcome.status == 0, outcome.text
     assert [rule for rule in outcome.rules if rule != "hloc"] == ["export_hloc"]
     folder = workflow.folder / "out" / "square" / "export_hloc"
@@ -70,7 +62,7 @@ def test_hlocs_files_go_out_and_come_in_again(finished, small_scene: Path, workf
     known = ["scene=square", "output=out", "front_end=imported", f"imported={folder}"]
     astray = again.run("--until", "extract_features", "--config", f"images={small_scene}", *known)
     assert astray.status == 0, astray.text
-    metrics = run(again, small_scene, "scene=square", "front_end=imported", f"imported={folder}")
+    metrics = again.metrics_of(small_scene, "scene=square", "front_end=imported", f"imported={folder}")
     assert metrics["reference_images_registered"] == 16
     before = json.loads((finished[0] / "evaluate_model" / "metrics.json").read_text())
     for degrees in ("1", "3", "5"):
@@ -86,8 +78,7 @@ def test_hlocs_files_hold_the_inliers_and_give_them_back(
     finished, small_scene: Path, workflow: Workflow
 ) -> None:
     copy_run(finished[0], workflow.folder)
-    config = [f"images={small_scene / 'images'}", f"reference={small_scene / 'reference'}", "output=out"]
-    outcome = workflow.run("hloc", "--config", *config)
+    outcome = workflow.run("hloc", *config_of(small_scene))
     assert outcome.status == 0, outcome.text
     folder = workflow.folder / "out" / "square" / "export_hloc"
     names = [str(name) for name in ImageIndex.read(finished[0] / "index_images" / "index.h5").names]
@@ -109,7 +100,7 @@ def test_hlocs_files_hold_the_inliers_and_give_them_back(
 
 
 def test_missing_weights_end_the_run_with_one_sentence(small_scene: Path, workflow: Workflow) -> None:
-    pytest.importorskip("torch", reason="the extra 'deep' is not installed")
+    import_extra("torch")
     outcome = workflow.run(
         "--config", f"images={small_scene / 'images'}", "output=out", "front_end=xfeat+lighterglue"
     )
@@ -143,8 +134,8 @@ def test_the_weights_are_fetched_by_their_own_target(
 
 def write_random_superpoint(folder: Path, matcher: str) -> None:
     """Random weights of SuperPoint and of a matcher of its keypoints, as their makers store them."""
-    torch = pytest.importorskip("torch", reason="the extra 'deep' is not installed")
-    pytest.importorskip("transformers", reason="the extra 'deep' is not installed")
+    torch = import_extra("torch")
+    import_extra("transformers")
     from safetensors.torch import save_file
 
     from snakesfm.features.extraction import DETECTORS
@@ -207,7 +198,7 @@ def test_places_found_pair_by_pair_are_merged(
     small_scene: Path, workflow: Workflow, tmp_path: Path
 ) -> None:
     config = ["front_end=virtual_places", f"cameras={small_scene / 'reference'}"]
-    metrics = run(workflow, small_scene, *config)
+    metrics = workflow.metrics_of(small_scene, *config)
     assert metrics["reference_images_registered"] == 16
     # places are off by up to two pixels of a small image
     assert 85 < metrics["pose_auc_1deg"] < 99.9 and 97 < metrics["pose_auc_5deg"] < 100
@@ -224,7 +215,7 @@ def test_places_found_pair_by_pair_are_merged(
     # other blocks and other pairs' places stay what they were
     (tmp_path / "blocks").mkdir()
     other = Workflow(tmp_path / "blocks")
-    assert run(other, small_scene, *config, "blocks=3") == metrics
+    assert other.metrics_of(small_scene, *config, "blocks=3") == metrics
     by_image = [
         {
             (str(name), block.keypoints[block.offsets[row] : block.offsets[row + 1]].tobytes())
@@ -237,16 +228,8 @@ def test_places_found_pair_by_pair_are_merged(
     assert by_image[0] == by_image[1] and len(by_image[0]) == 16
 
     # another radius matches nothing anew, and a lost tile is taken over from its former file
-    outcome = workflow.run(
-        "--until",
-        "index_matches",
-        "--config",
-        f"images={small_scene / 'images'}",
-        f"reference={small_scene / 'reference'}",
-        "output=out",
-        *config,
-        "merge_keypoints={radius_px: 2}",
-    )
+    other_radius = config_of(small_scene, *config, "merge_keypoints={radius_px: 2}")
+    outcome = workflow.run("--until", "index_matches", *other_radius)
     assert outcome.status == 0, outcome.text
     assert set(outcome.rules) == {"merge_keypoints", "index_matches"}
     (out / "match_pairs" / "0-1.h5").unlink()
@@ -256,8 +239,8 @@ def test_places_found_pair_by_pair_are_merged(
 
 
 def test_loftr_runs_through_with_random_weights(small_scene: Path, workflow: Workflow) -> None:
-    torch = pytest.importorskip("torch", reason="the extra 'deep' is not installed")
-    pytest.importorskip("kornia", reason="the extra 'deep' is not installed")
+    torch = import_extra("torch")
+    import_extra("kornia")
     from snakesfm.matching.detector_free import DETECTOR_FREE_MATCHERS
 
     (workflow.folder / "weights").mkdir()
@@ -292,8 +275,8 @@ def test_loftr_runs_through_with_random_weights(small_scene: Path, workflow: Wor
 def test_images_are_described_by_networks_with_random_weights(
     small_scene: Path, workflow: Workflow, method: str
 ) -> None:
-    torch = pytest.importorskip("torch", reason="the extra 'deep' is not installed")
-    pytest.importorskip("transformers", reason="the extra 'deep' is not installed")
+    torch = import_extra("torch")
+    import_extra("transformers")
     (workflow.folder / "weights").mkdir()
     path = workflow.folder / "weights" / WEIGHT_FILES[method].name
     if method == "netvlad":

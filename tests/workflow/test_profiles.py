@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 import yaml
+from extras import import_extra
 from workflow_runner import Workflow
 
 from snakesfm.pipeline import STAGES
@@ -76,9 +77,8 @@ def test_the_readme_explains_every_value(root: Path, name: str) -> None:
 
 @pytest.mark.parametrize("name", CLUSTERS)
 def test_jobs_ask_for_memory_and_time(small_scene: Path, tmp_path: Path, name: str) -> None:
-    pytest.importorskip(
-        f"snakemake_executor_plugin_{name.split('-')[0]}", reason="the extra is not installed"
-    )
+    extra = name.split("-")[0]
+    import_extra(f"snakemake_executor_plugin_{extra}", extra)
     storage = ["--default-storage-prefix", str(tmp_path)] if name == "kubernetes" else []
     outcome = Workflow(tmp_path, name).run(
         "--dry-run", *storage, "--config", f"images={small_scene / 'images'}", "output=out"
@@ -125,7 +125,7 @@ def test_undistorted_images_have_threads_and_ask_for_their_memory(
 def test_networks_ask_for_a_gpu_where_the_profile_has_them(
     small_scene: Path, tmp_path: Path, name: str, gpus: int
 ) -> None:
-    pytest.importorskip("snakemake_executor_plugin_slurm", reason="the extra is not installed")
+    import_extra("snakemake_executor_plugin_slurm", "slurm")
     outcome = Workflow(tmp_path, name).run(
         "--dry-run",
         "--config",

@@ -13,6 +13,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from extras import import_extra
 from slurm_cluster import Cluster, missing_programs, wait_for
 from workflow_runner import Workflow, config_of, copy_run, model_bytes
 
@@ -32,7 +33,7 @@ pytestmark = [
 @pytest.fixture(scope="module")
 def cluster() -> Iterator[Cluster]:
     """Four nodes of two cores each. Its folder has a short name: a socket's path is limited."""
-    pytest.importorskip("snakemake_executor_plugin_slurm", reason="the extra 'slurm' is not installed")
+    import_extra("snakemake_executor_plugin_slurm", "slurm")
     with tempfile.TemporaryDirectory(prefix="slurm") as folder:
         cluster = Cluster(Path(folder), nodes=4, cpus=2)
         try:

@@ -4,13 +4,18 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from synthetic_scene import run_rounds, true_model
+from plain_artifacts import HEADER
+from synthetic_scene import run_rounds, true_model, write_scene
 
+from snakesfm.artifacts import CameraCenters, CameraRotations, Reconstruction, TriangulatedPoints
 from snakesfm.bundle import lenses
 from snakesfm.bundle.interface import SolverSettings, bundle_adjuster
 from snakesfm.bundle.model import to_reconstruction
+from snakesfm.config.adjust_bundle import AdjustBundleOptions
 from snakesfm.geometry.camera import Camera
 from snakesfm.geometry.rotations import angle_of
+from snakesfm.stages import adjust_bundle
+from snakesfm.stages.job import StageJob
 from snakesfm.synthetic.problems import Layout, make_problem
 
 SIZE = (640, 480)
@@ -18,6 +23,10 @@ CENTER = (320.0, 240.0)
 FISHEYE = Camera("OPENCV_FISHEYE", *SIZE, (250.0, 250.0, *CENTER, 0.01, 0.0, 0.0, 0.0))
 START = Camera("SIMPLE_RADIAL", *SIZE, (300.0, *CENTER, 0.0), "estimated")
 RADIAL = Camera("SIMPLE_RADIAL", *SIZE, (280.0, *CENTER, -0.05))
+
+
+def seen_by(camera: Camera, layout: Layout = "facade"):
+    return make_problem(14, 900, layout=layout, noise_px=0.05, camera=camera, seed=3)
 
 
 def adjusted(
@@ -28,7 +37,7 @@ def adjusted(
     **changes: object,
 ):
     """What rounds make of keypoints of a true camera: the camera, the rounds' names and the largest error."""
-    made = make_problem(14, 900, layout=layout, noise_px=0.05, camera=true, seed=3)
+    made = seen_by(true, layout)
     model = replace(true_model(made), cameras=(start,))
     settings = {"widen_lenses": True, "refine_principal_points": False} | changes
     found, records = run_rounds(made, model, SolverSettings(constant_cameras=held), **settings)
@@ -63,6 +72,28 @@ def test_other_lenses_keep_their_model(case) -> None:
     camera, names, _ = adjusted(**case)
     assert camera.model == "SIMPLE_RADIAL"
     assert not any("lenses" in name for name in names)
+
+
+@pytest.mark.parametrize("wanted", ["auto", "SIMPLE_RADIAL"])
+def test_the_stage_looks_for_wider_lenses_where_no_model_is_wanted(tmp_path, wanted: str) -> None:
+    made = replace(seen_by(FISHEYE), cameras=(START,))
+    inputs = write_scene(made, tmp_path)
+    edges, images = np.zeros(len(made.pairs)), np.zeros(14, int)
+    CameraRotations(made.rotations, edges, edges.astype(int), images).write(inputs["rotations"], HEADER)
+    CameraCenters(made.centers, edges, np.zeros(0)).write(inputs["centers"], HEADER)
+    TriangulatedPoints(
+        made.points,
+        made.track_offsets,
+        made.track_image_ids,
+        made.track_keypoint_ids,
+        made.track_keypoints,
+        np.zeros((len(made.points), 3), np.uint8),
+    ).write(inputs["points"], HEADER)
+    options = AdjustBundleOptions(refine_keypoints=False)
+    output, settings = inputs["reconstruction"], {"camera_model": wanted}
+    adjust_bundle.run(StageJob("adjust_bundle", "scene", inputs, (output,), options, settings))
+    found = "OPENCV_FISHEYE" if wanted == "auto" else wanted
+    assert Reconstruction.read(output).camera_models.tolist() == [found]
 
 
 def test_a_lens_gone_wild_later_goes_back_to_the_wider_model() -> None:

@@ -8,22 +8,16 @@ from types import SimpleNamespace
 import numpy as np
 import pycolmap
 import pytest
+from plain_artifacts import write_plain_cameras, write_plain_index, write_plain_matches
 
-from snakesfm.artifacts import (
-    CalibratedCameras,
-    Header,
-    ImageIndex,
-    LocalFeatures,
-    PairMatches,
-    TwoViewGeometries,
-)
+from snakesfm.artifacts import Header, LocalFeatures, TwoViewGeometries
 from snakesfm.config.evaluate_model import EvaluateModelOptions
 from snakesfm.config.export_database import ExportDatabaseOptions
 from snakesfm.errors import ArtifactError
 from snakesfm.evaluation.colmap_model import model_poses
 from snakesfm.evaluation.metrics import Poses, evaluate_poses
 from snakesfm.export.database import panoramic_geometry
-from snakesfm.geometry.camera import Camera, cameras_to_columns
+from snakesfm.geometry.camera import Camera
 from snakesfm.geometry.rotations import exp_so3
 from snakesfm.stages import export_database
 from snakesfm.stages.job import StageJob
@@ -55,28 +49,11 @@ def descriptors_of(image: int, count: int) -> np.ndarray:
 def write_inputs(folder: Path, problem: SyntheticProblem) -> dict[str, str | list[str]]:
     """The artifacts of two blocks, with all pairs in one of three tiles."""
     folder.mkdir(exist_ok=True)
-    models, sizes, params, sources = cameras_to_columns(CAMERAS)
-    ImageIndex(
-        names=NAMES,
-        sizes=np.tile(SIZE, (COUNT, 1)),
-        sha256=["0"] * COUNT,
-        blocks=np.arange(COUNT) % 2,
-        camera_ids=np.arange(COUNT) % 2,
-        orientations=np.ones(COUNT, np.int32),
-        focal_exif_px=np.full(COUNT, np.nan),
-        gps=GPS,
-        duplicate_of=np.full(COUNT, -1),
-        camera_models=models,
-        camera_sizes=sizes,
-        camera_params=params,
-        camera_sources=sources,
-        refused_names=[],
-        refused_reasons=[],
-        warnings=[],
-    ).write(folder / "index.h5", HEADER)
-    CalibratedCameras(
-        models, sizes, params, sources, np.zeros(2), np.zeros(2, np.int32), np.zeros((0, 4), int), []
-    ).write(folder / "cameras.h5", HEADER)
+    of_image = np.arange(COUNT) % 2
+    write_plain_index(
+        folder / "index.h5", NAMES, [SIZE] * COUNT, CAMERAS, blocks=of_image, camera_ids=of_image, gps=GPS
+    )
+    write_plain_cameras(folder / "cameras.h5", CAMERAS, 0.0)
     for block in (0, 1):
         images = np.arange(block, COUNT, 2)
         counts = [len(problem.keypoints[image]) for image in images]
@@ -116,9 +93,8 @@ def write_tile(folder: Path, tile: int, problem: SyntheticProblem, rows: np.ndar
     if count:
         kinds[ROTATION_ONLY], rejections[REJECTED] = 2, TOO_FEW_INLIERS
     lengths = np.diff(offsets).astype(np.int32)
-    PairMatches(
-        problem.pairs[rows], ["d"] * count, offsets, matches, np.ones(len(matches), np.float32)
-    ).write(folder / f"matches{tile}.h5", HEADER)
+    of_pair = np.split(matches, offsets[1:-1]) if count else []
+    write_plain_matches(folder / f"matches{tile}.h5", problem.pairs[rows], of_pair)
     TwoViewGeometries(
         pairs=problem.pairs[rows],
         digests=["d"] * count,

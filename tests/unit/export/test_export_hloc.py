@@ -4,9 +4,9 @@ import io
 
 import numpy as np
 import pytest
-from plain_index import write_plain_index
+from plain_artifacts import write_plain_index, write_plain_matches
 
-from snakesfm.artifacts import Header, LocalFeatures, PairMatches, TwoViewGeometries
+from snakesfm.artifacts import Header, LocalFeatures, TwoViewGeometries
 from snakesfm.config.export_hloc import ExportHlocOptions
 from snakesfm.stages import export_hloc
 from snakesfm.stages.job import StageJob
@@ -17,7 +17,7 @@ def export(folder, names, pairs, terminal=None):
     count = len(names)
     header = Header("stage", 1, "scene")
     index, features, matches, geometries = (folder / f"{name}.h5" for name in "ifmg")
-    write_plain_index(index, names, [(320, 240)] * count, names)
+    write_plain_index(index, names, [(320, 240)] * count)
     LocalFeatures(
         image_ids=np.arange(count),
         names=names,
@@ -32,13 +32,7 @@ def export(folder, names, pairs, terminal=None):
         colors=np.zeros((2 * count, 3), np.uint8),
     ).write(features, header)
     rows = len(pairs)
-    PairMatches(
-        pairs=pairs,
-        digests=[""] * rows,
-        offsets=np.arange(rows + 1),
-        matches=np.zeros((rows, 2), int),
-        scores=np.ones(rows),
-    ).write(matches, header)
+    write_plain_matches(matches, pairs, np.zeros((rows, 1, 2), int))
     TwoViewGeometries(
         pairs=pairs,
         digests=[""] * rows,

@@ -117,6 +117,8 @@ def test_points_are_in_the_ply_with_their_colours(tmp_path, problem) -> None:
     order = np.lexsort(problem.points.T)
     found = np.lexsort(rows["xyz"].T.astype(np.float64))
     assert np.allclose(rows["xyz"][found], problem.points[order], atol=1e-4)
+    colors = Reconstruction.read(tmp_path / "reconstruction.h5").colors
+    np.testing.assert_array_equal(rows["rgb"][found], colors[order])
 
 
 def test_summary_says_what_is_there_and_what_is_missing(tmp_path, problem) -> None:

@@ -26,9 +26,10 @@ def test_a_model_with_positions_in_exif_is_in_metres_and_the_same_in_all_files(t
     assert content["orientation_override"] == "none"
     for frame in content["frames"]:
         image = model.images[frame["colmap_im_id"]]
-        center = image.projection_center()
-        np.testing.assert_allclose(np.array(frame["transform_matrix"])[:3, 3], center, atol=1e-9)
-        assert np.linalg.norm(center - local[image.image_id - 1]) < 3.0
+        pose = image.cam_from_world().inverse().matrix()
+        np.testing.assert_allclose(frame["transform_matrix"][:3], pose * [1, -1, -1, 1], atol=1e-9)
+        assert np.linalg.norm(image.projection_center() - local[image.image_id - 1]) < 3.0
+    model.update_point_3d_errors()
     assert 0.2 < model.compute_mean_reprojection_error() < 0.6
     points = {tuple(np.round(point.xyz, 3)) for point in model.points3D.values()}
     cloud = pycolmap.Reconstruction()

@@ -42,8 +42,17 @@ def folder(tmp_path):
         6,
     )
     exif.get_ifd(ExifTags.IFD.Exif)[ExifTags.Base.FocalLength] = IFDRational(88, 10)
-    draw(images / "a b.JPG", 1, exif=exif)
     draw(images / "b#{x}.jpg", 2, exif=exif)
+    exif.get_ifd(ExifTags.IFD.GPSInfo).update(
+        {
+            ExifTags.GPS.GPSLatitudeRef: "S",
+            ExifTags.GPS.GPSLatitude: (IFDRational(33), IFDRational(30), IFDRational(18)),
+            ExifTags.GPS.GPSLongitudeRef: "W",
+            ExifTags.GPS.GPSLongitude: (IFDRational(70), IFDRational(45), IFDRational(0)),
+            ExifTags.GPS.GPSAltitude: IFDRational(125, 10),
+        }
+    )
+    draw(images / "a b.JPG", 1, exif=exif)
     draw(images / "left" / "1.png", 3)
     draw(images / "right" / "1.png", 4)
     (images / "right" / "copy.png").write_bytes((images / "left" / "1.png").read_bytes())
@@ -59,6 +68,8 @@ def test_index_of_a_mixed_folder(tmp_path, folder, capsys):
     assert found.names.tolist() == ["a b.JPG", "b#{x}.jpg", "left/1.png", "right/1.png", "right/copy.png"]
     assert found.sizes.tolist() == [[96, 64]] * 5
     assert found.orientations.tolist() == [6, 6, 1, 1, 1]
+    np.testing.assert_allclose(found.gps[0], (-33.505, -70.75, 12.5))
+    assert np.isnan(found.gps[1:]).all()
     assert found.duplicate_of.tolist() == [-1, -1, -1, -1, 2]
     assert found.blocks.tolist() == deal_blocks(found.names.tolist(), 3)
     assert found.sha256.tolist() == list(digest_images(folder, found.names.tolist()).values())
@@ -99,6 +110,9 @@ def test_known_cameras_and_options(tmp_path, folder):
     found = index(tmp_path, folder, camera_sharing="per_image", camera_model="OPENCV")
     assert found.camera_ids.tolist() == [0, 1, 2, 3, 4]
     assert set(found.camera_models) == {"OPENCV"}
+    found = index(tmp_path, folder, use_exif_focal=False, default_focal_ratio=2.0)
+    assert set(found.camera_sources) == {"default"}
+    assert found.camera_params[:, 0].tolist() == [192.0] * 3
 
 
 def test_what_is_doubtful_of_cameras_is_kept_and_told(tmp_path, folder, capsys):

@@ -9,7 +9,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from plain_index import write_plain_index
+from plain_artifacts import write_plain_index
 
 from snakesfm.artifacts import ImageIndex, LocalFeatures
 from snakesfm.config.adjust_bundle import AdjustBundleOptions
@@ -45,7 +45,7 @@ def images(tmp_path):
 
 def index_of(images):
     sha256 = list(digest_images(images, NAMES).values())
-    write_plain_index(images.parent / "index.h5", NAMES, [SIZE] * len(NAMES), sha256)
+    write_plain_index(images.parent / "index.h5", NAMES, [SIZE] * len(NAMES), sha256=sha256)
     return IndexedImages(np.array(NAMES), np.array(sha256), images)
 
 

@@ -1,13 +1,14 @@
 """Which images or pairs a network gets at once."""
 
 import pytest
+from extras import import_extra
 
 from snakesfm.learned import batches, device
 
 
 @pytest.mark.parametrize(("there", "expected"), [(False, batches.CPU_BATCH), (True, batches.CUDA_BATCH)])
 def test_auto_depends_on_the_device(monkeypatch, there, expected):
-    torch = pytest.importorskip("torch", reason="the extra 'deep' is not installed")
+    torch = import_extra("torch")
     monkeypatch.setattr(torch.cuda, "is_available", lambda: there)
     device.use_device("auto")
     assert batches.choose_batch_size("auto") == expected

@@ -1,6 +1,7 @@
 """Where networks run."""
 
 import pytest
+from extras import import_extra
 
 from snakesfm.errors import ConfigError
 from snakesfm.learned import device
@@ -8,7 +9,7 @@ from snakesfm.learned import device
 
 @pytest.fixture(autouse=True)
 def torch():
-    yield pytest.importorskip("torch", reason="the extra 'deep' is not installed")
+    yield import_extra("torch")
     device.use_device("auto")
 
 

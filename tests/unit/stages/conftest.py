@@ -23,6 +23,8 @@ def images(tmp_path_factory):
         if name != "flat.png":
             picture = np.clip(picture + noise.normal(scale=2, size=picture.shape), 0, 255).astype(np.uint8)
         path.parent.mkdir(exist_ok=True)
-        path.write_bytes(cv2.imencode(".png", picture)[1].tobytes())
+        # red, green and blue differ, and gray is nearly the picture
+        colored = (picture[..., None] * (0.3, 1.0, 0.9)).astype(np.uint8)
+        path.write_bytes(cv2.imencode(".png", colored)[1].tobytes())
     (folder / "gone.png").write_bytes(b"\x89PNG no image")
     return folder

@@ -5,9 +5,10 @@ from itertools import combinations
 
 import numpy as np
 import pytest
-from synthetic_scene import HEADER, write_scene
+from plain_artifacts import write_plain_matches
+from synthetic_scene import write_scene
 
-from snakesfm.artifacts import CalibratedCameras, PairMatches
+from snakesfm.artifacts import CalibratedCameras
 from snakesfm.config.calibrate_cameras import CalibrateCamerasOptions
 from snakesfm.stages import calibrate_cameras
 from snakesfm.stages.job import StageJob
@@ -84,13 +85,8 @@ def with_overlay(made, rows):
 def calibrated(scene, folder):
     """What the stage makes of a scene."""
     inputs = write_scene(scene, folder)
-    PairMatches(
-        scene.pairs.astype(np.int32),
-        np.full(len(scene.pairs), "", dtype=object),
-        scene.match_offsets,
-        scene.matches.astype(np.int32),
-        np.ones(len(scene.matches), np.float32),
-    ).write(folder / "matches.h5", HEADER)
+    of_pair = np.split(scene.matches, scene.match_offsets[1:-1])
+    write_plain_matches(folder / "matches.h5", scene.pairs, of_pair)
     inputs = {name: inputs[name] for name in ("index", "features")} | {"matches": folder / "matches.h5"}
     job = StageJob(
         "calibrate_cameras", "scene", inputs, (folder / "out.h5",), CalibrateCamerasOptions(), threads=1

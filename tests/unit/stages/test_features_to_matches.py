@@ -47,7 +47,8 @@ def test_features_do_not_depend_on_the_blocks(whole, dealt):
 
 def test_colors_are_those_of_the_image(whole, images):
     found = whole.features()["other.png"]
-    picture = cv2.imread(str(images / "other.png"))
+    picture = cv2.imread(str(images / "other.png"))[..., ::-1]
+    assert np.ptp(picture.astype(int), axis=2).mean() > 50
     columns, rows = np.floor(found["keypoints"]).astype(int).T
     np.testing.assert_array_equal(found["colors"], picture[rows, columns])
 
@@ -205,6 +206,14 @@ def test_other_options_or_a_damaged_former_file_take_nothing_over(dealt, images,
     other = Scene(tmp_path / "again", images, 3)
     other.extract(former=scene)
     assert all(len(points["keypoints"]) <= 400 for points in other.features().values())
+
+
+@pytest.mark.parametrize("options", [{"contrast_threshold": 0.1}, {"edge_threshold": 1.3}])
+def test_stricter_thresholds_find_fewer_keypoints(whole, images, tmp_path, options):
+    scene = Scene(tmp_path, images, 1)
+    scene.extract(ExtractFeaturesOptions(max_keypoints=400, **options))
+    found, usual = (len(stage.features()["other.png"]["keypoints"]) for stage in (scene, whole))
+    assert 10 < found < 0.9 * usual
 
 
 def newer(kind, **options):

@@ -4,7 +4,7 @@ import cv2
 import h5py
 import numpy as np
 import pytest
-from plain_index import write_plain_index
+from plain_artifacts import write_plain_index
 
 from snakesfm.artifacts import LocalFeatures
 from snakesfm.config.extract_features import ExtractFeaturesOptions
@@ -28,7 +28,7 @@ def extract(tmp_path):
         for name in names:
             pixels = rng.integers(0, 255, (HEIGHT, WIDTH), dtype=np.uint8)
             cv2.imwrite(str(tmp_path / name), pixels)
-        write_plain_index(tmp_path / "index.h5", names, [(WIDTH, HEIGHT)] * len(names), [""] * len(names))
+        write_plain_index(tmp_path / "index.h5", names, [(WIDTH, HEIGHT)] * len(names))
         with h5py.File(tmp_path / "features.h5", "w") as file:
             for name, group in arrays.items():
                 for key, values in group.items():

@@ -3,7 +3,7 @@
 import cv2
 import numpy as np
 import pytest
-from plain_index import write_plain_index
+from plain_artifacts import write_plain_index
 
 from snakesfm.artifacts import Header, LocalFeatures, PairMatches
 from snakesfm.artifacts.pairs import PairCoordinates
@@ -20,7 +20,7 @@ SPREAD_PX = 1.0
 def write_index(folder, sizes):
     """An index of images 0.jpg, 1.jpg and so on, of these sizes."""
     names = [f"{k}.jpg" for k in range(len(sizes))]
-    write_plain_index(folder / "index.h5", names, sizes, [""] * len(sizes))
+    write_plain_index(folder / "index.h5", names, sizes)
 
 
 @pytest.fixture

@@ -4,9 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from synthetic_scene import HEADER, write_scene
+from plain_artifacts import write_plain_matches
+from synthetic_scene import write_scene
 
-from snakesfm.artifacts import CalibratedCameras, PairMatches
+from snakesfm.artifacts import CalibratedCameras
 from snakesfm.config.calibrate_cameras import CalibrateCamerasOptions
 from snakesfm.pipeline import STAGES
 from snakesfm.scene_plan import PROVISIONAL_STAGES
@@ -28,13 +29,8 @@ def made():
 
 def job_of(made, folder, **options):
     inputs = write_scene(made, folder)
-    PairMatches(
-        made.pairs.astype(np.int32),
-        np.full(len(made.pairs), "", dtype=object),
-        made.match_offsets,
-        made.matches.astype(np.int32),
-        np.ones(len(made.matches), np.float32),
-    ).write(folder / "matches.h5", HEADER)
+    of_pair = np.split(made.matches, made.match_offsets[1:-1])
+    write_plain_matches(folder / "matches.h5", made.pairs, of_pair)
     inputs = {name: inputs[name] for name in ("index", "features")} | {"matches": folder / "matches.h5"}
     options = CalibrateCamerasOptions(**options)
     return StageJob("calibrate_cameras", "scene", inputs, (folder / "out.h5",), options, threads=2)

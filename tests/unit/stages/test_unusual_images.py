@@ -6,6 +6,7 @@ import cv2
 import h5py
 import numpy as np
 import pytest
+from extras import import_extra
 from image_stages import NAMES, Scene
 from random_weights import write_netvlad
 
@@ -34,7 +35,7 @@ def test_one_bad_image_is_a_warning(images, tmp_path, capsys):
 
 
 def test_a_picture_that_cannot_be_read_resembles_none(images, tmp_path):
-    pytest.importorskip("torch")
+    import_extra("torch")
     scene = Scene(tmp_path, images, 1)
     scene.terminal = io.StringIO()
     write_netvlad(tmp_path / "netvlad_pitts30k.mat")

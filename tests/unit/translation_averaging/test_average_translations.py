@@ -62,15 +62,18 @@ def test_rays_of_images_without_a_centre_do_not_agree():
     assert agreeing_share(problem.select_rays(np.zeros(len(problem.rays), bool)), lost, LIMITS) == 1.0
 
 
-@pytest.mark.parametrize("layout", ["ring", "street", "area", "facade"])
-def test_whole_averaging_with_noise_and_outliers(layout):
+# about three times what is found
+@pytest.mark.parametrize(
+    ("layout", "most"), [("ring", 0.025), ("street", 0.07), ("area", 0.018), ("facade", 0.04)]
+)
+def test_whole_averaging_with_noise_and_outliers(layout, most):
     truth = make_problem(40, 2400, layout, 0.7, 0.1, 0.5, 0.1, seed=1)
     problem = positioning(truth, perturb_rotations(truth.rotations, 0.1, 2))
     result = average_translations(problem, SETTINGS)
     found = errors(result.centers, truth.centers)
     assert np.isfinite(result.centers).all()
-    assert 1e-4 < np.median(found) < 0.3
-    assert found.max() < 1.5
+    assert 1e-3 < np.median(found) < most
+    assert found.max() < 3 * most
     good = result.edge_residuals_rad[~truth.edge_outliers]
     assert np.degrees(np.median(good)) < 3.0
     assert np.degrees(np.median(result.ray_residuals_rad)) < 0.2
@@ -89,7 +92,7 @@ def test_weak_camera_is_not_thrown_away():
     result = average_translations(damaged, SETTINGS)
     assert np.isnan(result.centers[7]).all()
     assert np.isfinite(np.delete(result.centers, 7, axis=0)).all()
-    assert errors(result.centers, truth.centers).max() < 0.2
+    assert errors(result.centers, truth.centers).max() < 0.006
 
 
 def test_camera_with_a_few_good_rays_is_placed():
@@ -101,7 +104,7 @@ def test_camera_with_a_few_good_rays_is_placed():
     few = problem.select_rays(rows).select_edges(~(problem.pairs == 7).any(axis=1))
     result = average_translations(few, SETTINGS)
     assert np.isfinite(result.centers[7]).all()
-    assert errors(result.centers, truth.centers)[7] < 0.2
+    assert errors(result.centers, truth.centers)[7] < 0.005
 
 
 def test_pairs_alone_position_what_they_determine():
@@ -110,7 +113,7 @@ def test_pairs_alone_position_what_they_determine():
     problem = problem.select_rays(np.zeros(len(problem.rays), dtype=bool))
     result = average_translations(problem, SETTINGS)
     assert np.isfinite(result.centers[:, 0]).sum() >= 20
-    assert 1e-4 < np.median(errors(result.centers, truth.centers)) < 0.1
+    assert 1e-3 < np.median(errors(result.centers, truth.centers)) < 0.02
 
 
 def test_two_images_have_a_unit_baseline():
@@ -125,7 +128,7 @@ def test_three_images():
     truth = make_problem(3, 600, "area", noise_px=0.2, rotation_noise_deg=0.1, seed=8)
     result = average_translations(positioning(truth), SETTINGS)
     assert np.isfinite(result.centers).all()
-    assert errors(result.centers, truth.centers).max() < 0.05
+    assert errors(result.centers, truth.centers).max() < 0.002
 
 
 def test_nothing_and_the_smaller_of_two_parts_get_no_center():

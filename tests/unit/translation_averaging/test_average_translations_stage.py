@@ -1,91 +1,30 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from plain_artifacts import HEADER, write_plain_tracks
+from synthetic_scene import write_scene
 
-from snakesfm.artifacts import (
-    CalibratedCameras,
-    CameraCenters,
-    CameraRotations,
-    ImageIndex,
-    TrackTable,
-    ViewGraph,
-)
-from snakesfm.artifacts.base import Header
+from snakesfm.artifacts import CameraCenters, CameraRotations, ViewGraph
 from snakesfm.config.average_translations import AverageTranslationsOptions
 from snakesfm.errors import SceneError
-from snakesfm.geometry.camera import cameras_to_columns
 from snakesfm.stages.average_translations import run
 from snakesfm.stages.job import StageJob
 from snakesfm.synthetic.problems import make_problem
 
-HEADER = Header("test", 1, "scene")
 
-
-def write_inputs(folder, truth, rotations, kinds=None, labels=None):
-    count, edges = truth.image_count, len(truth.pairs)
-    models, sizes, params, sources = cameras_to_columns(truth.cameras)
-    index = ImageIndex(
-        names=[f"{i:03d}.jpg" for i in range(count)],
-        sizes=np.tile(sizes[0], (count, 1)),
-        sha256=["0"] * count,
-        blocks=np.zeros(count, np.int32),
-        camera_ids=truth.camera_ids,
-        orientations=np.ones(count, np.int32),
-        focal_exif_px=np.full(count, np.nan),
-        gps=np.full((count, 3), np.nan),
-        duplicate_of=np.full(count, -1, np.int32),
-        camera_models=models,
-        camera_sizes=sizes,
-        camera_params=params,
-        camera_sources=sources,
-        refused_names=[],
-        refused_reasons=[],
-        warnings=[],
-    )
-    cameras = CalibratedCameras(
-        models=models,
-        sizes=sizes,
-        params=params,
-        sources=sources,
-        focal_sigma=np.zeros(1),
-        pair_counts=np.zeros(1, np.int32),
-        overlay_cells=np.zeros((0, 4), np.int32),
-        warnings=np.zeros(0, dtype=object),
-    )
-    graph = ViewGraph(
-        pairs=truth.pairs,
-        rotations=truth.edge_rotations,
-        translations=truth.edge_translations,
-        covariances=truth.edge_covariances,
-        kinds=np.zeros(edges, np.int8) if kinds is None else kinds,
-        inlier_counts=truth.edge_inlier_counts,
-        triangulation_angles_deg=truth.edge_angles_deg,
-        labels=np.zeros(edges, np.int8) if labels is None else labels,
-        cycle_min_deg=np.zeros(edges),
-        cycle_median_deg=np.zeros(edges),
-        components=np.zeros(count, np.int32),
-    )
-    averaged = CameraRotations(
+def write_inputs(folder, truth, rotations, **edges):
+    """The scene up to its tracks, with these averaged rotations and columns of the view graph."""
+    inputs = write_scene(truth, folder)
+    replace(ViewGraph.read(inputs["graph"]), **edges).write(inputs["graph"], HEADER)
+    count = len(truth.pairs)
+    CameraRotations(
         rotations=rotations,
-        residuals_deg=np.zeros(edges),
-        labels=np.zeros(edges, np.int8),
+        residuals_deg=np.zeros(count),
+        labels=np.zeros(count, int),
         components=np.where(np.isfinite(rotations[:, 0, 0]), 0, -1),
-    )
-    tracks = TrackTable(
-        offsets=truth.track_offsets,
-        image_ids=truth.track_image_ids,
-        keypoint_ids=truth.track_keypoint_ids,
-        part_ids=np.repeat(np.arange(len(truth.track_offsets) - 1), np.diff(truth.track_offsets)),
-        keypoints=truth.track_keypoints,
-        colors=np.zeros((len(truth.track_image_ids), 3), np.uint8),
-        lengths_unmerged=np.zeros(0, np.int64),
-        lengths_merged=np.zeros(0, np.int64),
-    )
-    inputs = {}
-    for name, artifact in dict(
-        index=index, cameras=cameras, graph=graph, rotations=averaged, tracks=tracks
-    ).items():
-        inputs[name] = folder / f"{name}.h5"
-        artifact.write(inputs[name], HEADER)
+    ).write(inputs["rotations"], HEADER)
+    write_plain_tracks(inputs["tracks"], truth)
     return inputs
 
 
@@ -109,7 +48,7 @@ def test_stage_writes_centers_and_residuals(tmp_path, method):
     kinds[0] = 2
     labels = np.zeros(len(truth.pairs), np.int8)
     labels[1] = 1
-    inputs = write_inputs(tmp_path, truth, rotations, kinds, labels)
+    inputs = write_inputs(tmp_path, truth, rotations, kinds=kinds, labels=labels)
     run(stage_job(tmp_path, inputs, method=method))
     result = CameraCenters.read(tmp_path / "centers.h5")
     assert np.isnan(result.centers[5]).all()
@@ -126,15 +65,6 @@ def test_stage_writes_centers_and_residuals(tmp_path, method):
     assert (result.edge_residuals_deg[truth.edge_outliers & ~off] < 5.0).mean() < 0.2
     assert (result.edge_residuals_deg[~off & ~truth.edge_outliers] < 5.0).mean() > 0.9
     assert np.median(result.ray_residuals_deg) < 0.15
-
-
-def test_default_is_identical_twice(tmp_path):
-    truth = make_problem(10, 500, "ring", 0.4, 0.05)
-    inputs = write_inputs(tmp_path, truth, truth.rotations)
-    run(stage_job(tmp_path, inputs))
-    first = (tmp_path / "centers.h5").read_bytes()
-    run(stage_job(tmp_path, inputs))
-    assert (tmp_path / "centers.h5").read_bytes() == first
 
 
 def test_two_images(tmp_path):

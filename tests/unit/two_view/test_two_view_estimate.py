@@ -271,14 +271,6 @@ def test_rejected_without_pose_is_nan_and_empty(two_views: Views) -> None:
     assert found.inliers.dtype == np.int32
 
 
-def test_same_arguments_same_result(two_views: Views) -> None:
-    views = two_views(seed=9)
-    first, second = estimate(views), estimate(views)
-    assert np.array_equal(first.rotation, second.rotation)
-    assert np.array_equal(first.covariance, second.covariance)
-    assert np.array_equal(first.inliers, second.inliers)
-
-
 def test_keypoints_at_one_place_count_once(two_views: Views) -> None:
     views = two_views(seed=10, outliers=0, count=100)
     doubled_i = np.concatenate([views.keypoints_i, views.keypoints_i])

@@ -3,67 +3,35 @@
 from collections.abc import Callable
 from dataclasses import fields, replace
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import numpy as np
 import pytest
+from plain_artifacts import HEADER, write_plain_cameras, write_plain_index, write_plain_matches
 
-from snakesfm.artifacts import (
-    CalibratedCameras,
-    Header,
-    ImageIndex,
-    LocalFeatures,
-    PairMatches,
-    TwoViewGeometries,
-)
+from snakesfm.artifacts import CalibratedCameras, LocalFeatures, TwoViewGeometries
 from snakesfm.artifacts.pairs import KINDS, REJECTIONS
+from snakesfm.calibration import focal
 from snakesfm.config.calibrate_cameras import CalibrateCamerasOptions
 from snakesfm.config.estimate_two_view import EstimateTwoViewOptions
 from snakesfm.errors import ArtifactError
-from snakesfm.geometry.camera import Camera, cameras_to_columns
+from snakesfm.geometry.camera import Camera
 from snakesfm.stages import calibrate_cameras, estimate_two_view
 from snakesfm.stages.job import StageJob
 from snakesfm.two_view.estimate import estimate_two_view_geometry
 
 Views = Callable[..., Any]
-HEADER = Header("test", 1, "scene")
 FEATURES = tuple(field.name for field in fields(LocalFeatures))
 
 
 def write_inputs(folder: Path, views: Any, source: str, enlarged: int = 1) -> dict[str, Any]:
     """Three images of which 0 and 1 are a pair; image 2 matches image 0 in twelve places only."""
     camera = Camera("SIMPLE_RADIAL", 1000, 800, (900.0, 500.0, 400.0, 0.0), source).scaled(enlarged)
-    models, sizes, params, sources = cameras_to_columns([camera])
-    names = np.array(["a.jpg", "b.jpg", "c.jpg"], dtype=object)
-    ImageIndex(
-        names=names,
-        sizes=np.tile(sizes, (3, 1)),
-        sha256=names,
-        blocks=np.zeros(3, dtype=np.int32),
-        camera_ids=np.zeros(3, dtype=np.int32),
-        orientations=np.ones(3, dtype=np.int32),
-        focal_exif_px=np.full(3, np.nan),
-        gps=np.full((3, 3), np.nan),
-        duplicate_of=np.full(3, -1, dtype=np.int32),
-        camera_models=np.array(models, dtype=object),
-        camera_sizes=sizes,
-        camera_params=params,
-        camera_sources=np.array(sources, dtype=object),
-        refused_names=np.array([], dtype=object),
-        refused_reasons=np.array([], dtype=object),
-        warnings=np.zeros(0, dtype=object),
-    ).write(folder / "index.h5", HEADER)
+    names = ["a.jpg", "b.jpg", "c.jpg"]
+    write_plain_index(folder / "index.h5", names, [(camera.width, camera.height)] * 3, [camera])
     if source == "given":
-        CalibratedCameras(
-            np.array(models, dtype=object),
-            sizes,
-            params,
-            np.array(sources, dtype=object),
-            np.zeros(1),
-            np.zeros(1, dtype=np.int32),
-            np.zeros((0, 4), dtype=np.int32),
-            np.zeros(0, dtype=object),
-        ).write(folder / "cameras.h5", HEADER)
+        write_plain_cameras(folder / "cameras.h5", [camera], 0.0)
     keypoints = [views.keypoints_i, views.keypoints_j, views.keypoints_j[:50]]
     total = sum(len(k) for k in keypoints)
     LocalFeatures(
@@ -80,23 +48,13 @@ def write_inputs(folder: Path, views: Any, source: str, enlarged: int = 1) -> di
         colors=np.zeros((total, 3), dtype=np.uint8),
     ).write(folder / "features.h5", HEADER)
     few = np.column_stack([np.arange(12), np.arange(12)]).astype(np.int32)
-    write_matches(folder, [(0, 1), (0, 2)], [views.matches, few])
+    write_plain_matches(folder / "matches.h5", [(0, 1), (0, 2)], [views.matches, few])
     return {
         "index": folder / "index.h5",
         "cameras": folder / "cameras.h5",
         "features": [folder / "features.h5"],
         "matches": folder / "matches.h5",
     }
-
-
-def write_matches(folder: Path, pairs: list[tuple[int, int]], matches: list[Any]) -> None:
-    PairMatches(
-        pairs=np.array(pairs, dtype=np.int32).reshape(-1, 2),
-        digests=np.array([f"{i}-{j}" for i, j in pairs], dtype=object),
-        offsets=np.cumsum([0, *(len(m) for m in matches)]),
-        matches=np.concatenate(matches) if matches else np.zeros((0, 2), dtype=np.int32),
-        scores=np.ones(sum(len(m) for m in matches), dtype=np.float32),
-    ).write(folder / "matches.h5", HEADER)
 
 
 def pose_job(folder: Path, inputs: dict[str, Any], **changes: Any) -> StageJob:
@@ -127,7 +85,7 @@ def test_what_stands_still_on_an_overlay_makes_no_pair(two_views: Views, tmp_pat
     columns["keypoints"][-50:] = views.keypoints_i[:50]
     LocalFeatures(**columns).write(tmp_path / "features.h5", HEADER)
     same = np.column_stack([np.arange(50)] * 2).astype(np.int32)
-    write_matches(tmp_path, [(0, 1), (0, 2)], [views.matches, same])
+    write_plain_matches(tmp_path / "matches.h5", [(0, 1), (0, 2)], [views.matches, same])
     cells = np.unique(np.floor(views.keypoints_i[:50] / 8).astype(np.int32), axis=0)
     for name, covered in (("none", cells[:0]), ("stamp", cells)):
         given = CalibratedCameras.read(tmp_path / "cameras.h5")
@@ -166,12 +124,36 @@ def test_larger_photographs_are_judged_as_the_detector_saw_them(two_views: Views
     assert not np.array_equal(rows["strict"].rotations, rows["small"].rotations)
 
 
-def test_run_again_gives_the_same_bytes(two_views: Views, tmp_path: Path) -> None:
-    job = pose_job(tmp_path, write_inputs(tmp_path, two_views(seed=2), "given"))
-    estimate_two_view.run(job)
-    first = (tmp_path / "0-0.h5").read_bytes()
-    estimate_two_view.run(job)
-    assert (tmp_path / "0-0.h5").read_bytes() == first
+def test_estimators_are_given_the_best_matches_first(
+    two_views: Views, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    views = two_views(seed=1)
+    scores = np.random.default_rng(0).permutation(300) / 300
+    order = views.matches[np.argsort(-scores)]
+    given = {}
+
+    def remember(module: ModuleType, name: str) -> None:
+        function = getattr(module, name)
+
+        def remembered(*arguments: Any) -> Any:
+            given[name] = arguments
+            return function(*arguments)
+
+        monkeypatch.setattr(module, name, remembered)
+
+    remember(estimate_two_view, "estimate_two_view_geometry")
+    remember(focal, "calibrate_focals")
+    # these have calibrated cameras, and those some to calibrate
+    write_inputs(tmp_path, views, "given")
+    inputs = write_inputs(tmp_path, views, "exif")
+    write_plain_matches(inputs["matches"], [(0, 1)], [views.matches], scores)
+    estimate_two_view.run(pose_job(tmp_path, inputs))
+    options = CalibrateCamerasOptions()
+    calibrate_cameras.run(StageJob("calibrate_cameras", "scene", inputs, (tmp_path / "out.h5",), options))
+    np.testing.assert_array_equal(given["estimate_two_view_geometry"][2], order)
+    (pair,) = given["calibrate_focals"][0]
+    np.testing.assert_array_equal(pair.points_i, views.keypoints_i[order[:, 0]])
+    np.testing.assert_array_equal(pair.points_j, views.keypoints_j[order[:, 1]])
 
 
 def test_unchanged_pairs_are_taken_over(
@@ -239,7 +221,7 @@ def test_damaged_former_is_ignored(two_views: Views, tmp_path: Path) -> None:
 
 def test_tile_without_pairs(two_views: Views, tmp_path: Path) -> None:
     inputs = write_inputs(tmp_path, two_views(seed=5), "given")
-    write_matches(tmp_path, [], [])
+    write_plain_matches(tmp_path / "matches.h5", [], [])
     estimate_two_view.run(pose_job(tmp_path, inputs))
     assert TwoViewGeometries.read(tmp_path / "0-0.h5").pairs.shape == (0, 2)
 
@@ -273,13 +255,18 @@ def test_one_pair_leaves_what_is_known(two_views: Views, tmp_path: Path, source:
     assert found.focal_sigma.tolist() == [sigma]
 
 
-def test_calibration_stage_estimates(two_views: Views, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("wanted", "source"), [(True, "estimated"), (False, "exif")])
+def test_calibration_stage_estimates(two_views: Views, tmp_path: Path, wanted: bool, source: str) -> None:
     inputs = write_inputs(tmp_path, two_views(seed=8, count=400), "exif")
-    options = CalibrateCamerasOptions(min_votes=1, systematic_sigma=0.0, max_sigma=10.0)
+    options = CalibrateCamerasOptions(
+        estimate_focals=wanted, min_votes=1, systematic_sigma=0.0, max_sigma=10.0
+    )
     job = StageJob("calibrate_cameras", "scene", inputs, (tmp_path / "out.h5",), options, seed=5)
     calibrate_cameras.run(job)
     found = CalibratedCameras.read(tmp_path / "out.h5")
+    assert found.sources.tolist() == [source]
     assert found.params[0, 0] == pytest.approx(900.0, rel=0.1)
+    assert (found.params[0, 0] != 900.0) == wanted
     assert found.params[0, 3] == 0.0
 
 
@@ -302,7 +289,7 @@ def test_larger_photographs_have_longer_focal_lengths(two_views: Views, tmp_path
 
 def test_calibration_stage_without_pairs(two_views: Views, tmp_path: Path) -> None:
     inputs = write_inputs(tmp_path, two_views(seed=9), "default")
-    write_matches(tmp_path, [], [])
+    write_plain_matches(tmp_path / "matches.h5", [], [])
     job = StageJob(
         "calibrate_cameras", "scene", inputs, (tmp_path / "out.h5",), CalibrateCamerasOptions(), seed=5
     )
