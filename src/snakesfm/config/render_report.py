@@ -10,7 +10,7 @@ from snakesfm.config.base import StageOptions
 class RenderReportOptions(StageOptions):
     """Contents of the report."""
 
-    stage_version: ClassVar[int] = 3
+    stage_version: ClassVar[int] = 4
 
     max_images: int = Field(1000, ge=1)
     """Largest number of rows in the table of images; if there are more, those with the fewest

@@ -49,7 +49,7 @@ def inputs(made, tmp_path):
     )
     centers = made.centers + np.random.default_rng(0).normal(0, 0.01, (COUNT, 3))
     centers[5] = np.nan
-    CameraCenters(centers, np.zeros(edges), np.zeros(0)).write(inputs["centers"], HEADER)
+    CameraCenters(centers, components, np.zeros(edges), np.zeros(0)).write(inputs["centers"], HEADER)
     return inputs
 
 

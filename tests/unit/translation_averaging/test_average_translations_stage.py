@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -126,6 +128,32 @@ def test_stage_writes_centers_and_residuals(tmp_path, method):
     assert (result.edge_residuals_deg[truth.edge_outliers & ~off] < 5.0).mean() < 0.2
     assert (result.edge_residuals_deg[~off & ~truth.edge_outliers] < 5.0).mean() > 0.9
     assert np.median(result.ray_residuals_deg) < 0.15
+
+
+def test_a_component_with_which_few_rays_agree_is_warned_of_by_itself(tmp_path, capsys):
+    truth = make_problem(30, 2000, "area", 0.3, 0.05, seed=2)
+    inputs = write_inputs(tmp_path, truth, truth.rotations)
+    tracks = TrackTable.read(inputs["tracks"])
+    wild = np.isin(tracks.image_ids, [3, 5, 8, 10])
+    keypoints = np.where(
+        wild[:, None], np.random.default_rng(0).uniform(0, 480, (len(wild), 2)), tracks.keypoints
+    )
+    replace(tracks, keypoints=keypoints.astype(np.float32)).write(inputs["tracks"], HEADER)
+    averaged = CameraRotations.read(inputs["rotations"])
+    components = (np.arange(30) < 12).astype(int)
+    replace(averaged, components=components).write(inputs["rotations"], HEADER)
+    run(stage_job(tmp_path, inputs, restarts=0))
+    found = CameraCenters.read(tmp_path / "centers.h5").components
+    placed = found >= 0
+    assert placed[12:].all() and not placed[[3, 5, 8, 10]].any() and placed.sum() >= 24
+    np.testing.assert_array_equal(found[placed], components[placed])
+    said, count = capsys.readouterr(), placed.sum() - 18
+    (warning,) = [line for line in said.err.splitlines() if "warning" in line]
+    assert f"agree with the positions of {count} cameras" in warning
+    assert (
+        f"{placed.sum()} of 30 images with a rotation are positioned in frames of 18, {count} im"
+        in said.out
+    )
 
 
 def test_default_is_identical_twice(tmp_path):
