@@ -33,7 +33,8 @@ if TYPE_CHECKING:
 
 DOUBTFUL = (
     "only {percent:.0f} % of the rays agree with the positions of {count} cameras: the model may be "
-    "folded, as happens where parts of the scene look alike; check it, or add images in between."
+    "folded, as happens where parts of the scene look alike, or lack cameras; check it, or add images in "
+    "between."
 )
 # average_rotations.min_component_images, where nobody says what it is
 USUAL_COMPONENT_IMAGES = 5
@@ -44,8 +45,8 @@ def run(job: StageJob) -> None:
 
     A component of the rotations may fall into several, if nothing tells their relative size.
 
-    Edges take part that every filter kept and whose translation has a direction; rays of the tracks take
-    part as far as ``rays_per_camera`` allows.
+    Edges take part that rotation averaging kept and whose translation has a direction; rays of the tracks
+    take part as far as ``rays_per_camera`` allows.
 
     Raises
     ------
@@ -97,7 +98,7 @@ def _problem(
 ) -> tuple[PositioningProblem, Array]:
     """What images with a rotation tell of their positions, and which edges (E,) bool take part."""
     turned = np.isfinite(averaged.rotations[:, 0, 0])
-    usable = (graph.labels == 0) & (averaged.labels == 0) & turned[graph.pairs].all(axis=1)
+    usable = (averaged.labels == 0) & turned[graph.pairs].all(axis=1)
     usable &= (graph.kinds != KINDS.index("rotation_only")) & np.isfinite(graph.translations[:, 0])
     # a part that a look-alike joined to a track is a landmark of its own: positioning cannot throw out rays
     by_part = np.argsort(tracks.part_ids, kind="stable")

@@ -61,7 +61,8 @@ def write_inputs(folder, truth, rotations, kinds=None, labels=None):
         kinds=np.zeros(edges, np.int8) if kinds is None else kinds,
         inlier_counts=truth.edge_inlier_counts,
         triangulation_angles_deg=truth.edge_angles_deg,
-        labels=np.zeros(edges, np.int8) if labels is None else labels,
+        # what the filter refused counts as averaging has it
+        labels=np.arange(edges) % 2,
         cycle_min_deg=np.zeros(edges),
         cycle_median_deg=np.zeros(edges),
         components=np.zeros(count, np.int32),
@@ -69,7 +70,7 @@ def write_inputs(folder, truth, rotations, kinds=None, labels=None):
     averaged = CameraRotations(
         rotations=rotations,
         residuals_deg=np.zeros(edges),
-        labels=np.zeros(edges, np.int8),
+        labels=np.zeros(edges, np.int8) if labels is None else labels,
         components=np.where(np.isfinite(rotations[:, 0, 0]), 0, -1),
     )
     tracks = TrackTable(
