@@ -17,8 +17,8 @@ DOUBTFUL_SHARE = 0.75
 # positions with which fewer agree are no better than none
 LEAST_SHARE = 0.6
 MORE_RAYS = 15
-# in all: global positioning takes a few seconds for so many
-MOST_RAYS = 500_000
+# in all: global positioning takes most of a minute for so many, and is tried several times
+MOST_RAYS = 200_000
 
 
 @dataclass(frozen=True)

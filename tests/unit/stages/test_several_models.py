@@ -178,6 +178,21 @@ def test_parts_of_one_frame_of_rotations_become_a_model_each(made, one_turned, t
         assert rotation_errors_deg(model.rotations[part], made.rotations[part]).max() < 0.5
 
 
+def test_images_that_the_largest_model_registers_leave_their_part(made, scene, tmp_path):
+    averaged = CameraCenters.read(scene["centers"])
+    odd = np.isin(np.arange(COUNT), SMALL + np.arange(5))
+    centers = np.where(odd[:, None], 0.3 * averaged.centers + 5.0, averaged.centers)
+    components = np.where(odd, 2, averaged.components)
+    inputs = scene | {"centers": tmp_path / "centers.h5", "points": tmp_path / "points.h5"}
+    replace(averaged, centers=centers, components=components).write(inputs["centers"], HEADER)
+    run(triangulate_tracks, TriangulateTracksOptions(), inputs, inputs["points"])
+    options = AdjustBundleOptions(refine_keypoints=False)
+    run(adjust_bundle, options, inputs, tmp_path / "model.h5", intrinsics="fixed", images="")
+    model = Reconstruction.read(tmp_path / "model.h5")
+    np.testing.assert_array_equal(model.models, np.where(PART, 0, 1))
+    assert rotation_errors_deg(model.rotations[PART], made.rotations[PART]).max() < 0.5
+
+
 def test_tracks_are_split_by_frame(one_turned):
     tracks = TrackTable.read(one_turned["tracks"])
     whole = split_by_frame(tracks, np.where(np.arange(COUNT) % 3 == 0, -1, 0))
