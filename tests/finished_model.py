@@ -11,6 +11,7 @@ from PIL import Image
 from plain_artifacts import write_plain_cameras, write_plain_index, write_plain_tracks
 
 from snakesfm.artifacts import (
+    CameraCenters,
     CameraRotations,
     Header,
     LocalFeatures,
@@ -260,6 +261,12 @@ def write_former_stages(folder: Path, problem: SyntheticProblem) -> dict[str, ob
         labels=np.where(np.arange(kept.sum()) == 0, 2, 0),
         components=np.where(np.arange(COUNT) == LOST, -1, 0),
     ).write(folder / "rotations.h5", HEADER)
+    CameraCenters(
+        centers=np.where(np.arange(COUNT)[:, None] == LOST, np.nan, problem.centers),
+        components=np.where(np.arange(COUNT) == LOST, -1, 0),
+        edge_residuals_deg=np.zeros(kept.sum()),
+        ray_residuals_deg=np.zeros(len(problem.track_image_ids)),
+    ).write(folder / "centers.h5", HEADER)
     write_plain_tracks(folder / "tracks.h5", problem)
     TriangulatedPoints(
         points=problem.points,
@@ -275,7 +282,7 @@ def write_former_stages(folder: Path, problem: SyntheticProblem) -> dict[str, ob
         path.parent.mkdir(parents=True)
         path.write_text(describe_cost(stage, 0.0, seconds, 12.0, 321.0) + "\n", "utf-8")
     write_cameras(folder, (0.02, np.nan))
-    names = ("cameras", "graph", "rotations", "tracks", "points", "index", "reconstruction")
+    names = ("cameras", "graph", "rotations", "tracks", "centers", "points", "index", "reconstruction")
     inputs: dict[str, object] = {name: str(folder / f"{name}.h5") for name in names}
     # of a run with more blocks
     (log.parent / "2-3.log").write_text(describe_cost("match_pairs", 0.0, 70.0, 7.0, 9.0) + "\n", "utf-8")

@@ -37,6 +37,40 @@ def positioning(truth, rotations=None):
     )
 
 
+def two_rooms(first, second, seed=1):
+    """A walk through a room, a turn on the spot by 6 images, and a walk through another: centres, problem.
+
+    Nothing tells how large the second room is beside the first. Images on one spot have no direction.
+    """
+    rng = np.random.default_rng(seed)
+    steps = 0.2 * np.r_[np.arange(-first, 0), np.zeros(6), np.arange(1, second + 1)]
+    angles = np.radians(np.r_[np.full(first, 90), 90 - 30 * np.arange(1, 7), np.full(second, -90)])
+    centers = np.stack([steps, 0 * steps, 0 * steps], axis=1)
+    ahead = np.stack([np.cos(angles), np.sin(angles), 0 * angles], axis=1)
+    boxes = [([-8, 3, -2], [4, 6, 2]), ([-4, -6, -2], [7, -3, 2]), ([3, -3, -2], [6, 3, 2])]
+    points = np.concatenate([rng.uniform(*box, (450, 3)) for box in boxes])
+    rays = points[:, None] - centers
+    rays /= np.linalg.norm(rays, axis=2, keepdims=True)
+    seen = np.einsum("pni,ni->pn", rays, ahead) > np.cos(np.radians(30))
+    tracks, images = np.nonzero(seen)
+    shared = np.einsum("pi,pj->ij", seen.astype(int), seen) >= 15
+    near = np.triu(shared, 1) & (np.subtract.outer(np.arange(len(steps)), np.arange(len(steps))) >= -6)
+    pairs = np.argwhere(near & (np.subtract.outer(steps, steps) != 0))
+    directions = centers[pairs[:, 1]] - centers[pairs[:, 0]]
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    directions, rays = directions + rng.normal(size=directions.shape) * 5e-3, rays[tracks, images]
+    rays = rays + rng.normal(size=rays.shape) * 5e-4
+    return centers, PositioningProblem(
+        len(steps),
+        pairs,
+        directions / np.linalg.norm(directions, axis=1, keepdims=True),
+        np.full(len(pairs), 5e-3),
+        images,
+        tracks,
+        rays / np.linalg.norm(rays, axis=1, keepdims=True),
+    )
+
+
 def thinned(problem):
     """The rays that averagers are given."""
     return with_rays(problem, SETTINGS.rays_per_camera)

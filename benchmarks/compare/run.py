@@ -177,7 +177,8 @@ def _report(result: Result) -> Result:
     if result.failure:
         text = result.failure
     else:
-        areas = [f"{result.metrics[f'relative_pose_auc_{degrees}deg']:.1f}" for degrees in (1, 3, 5)]
+        found = (result.metrics[f"relative_pose_auc_{degrees}deg"] for degrees in (1, 3, 5))
+        areas = ["none" if area is None else f"{area:.1f}" for area in found]
         text = f"{result.metrics['registered_images']} of {result.images} images, AUC {'/'.join(areas)}, "
         text += ", ".join(f"{name} {cost.seconds:.1f} s" for name, cost in result.stages.items())
         text += "" if result.undisturbed else " (disturbed)"

@@ -62,7 +62,7 @@ With a reference model there are also:
 
 | key | meaning |
 |---|---|
-| `reference_images`, `reference_images_present`, `reference_images_registered` | images with a pose in the reference; how many of them this scene has; how many have a pose in the model. All following values are of the first |
+| `reference_images`, `reference_images_present`, `reference_images_registered` | images with a pose in the reference; how many of them this scene has, by their names; how many have a pose in the model. All following values are of the first; areas are null where the second is 0 |
 | `relative_pose_auc_Tdeg` | area under the recall curve up to T degrees, in per cent, of the larger of the errors in rotation and in direction of translation, over all ordered pairs of images (a sample beyond 2,000 images); a pair with an image without a pose counts as 180 degrees |
 | `relative_pairs` | number of these pairs |
 | `relative_rotation_error_deg_S`, `relative_translation_angle_deg_S` | these errors over pairs of registered images; S is median, mean, p90 or max |
@@ -70,7 +70,7 @@ With a reference model there are also:
 | `rotation_error_deg_S`, `translation_angle_deg_S`, `position_error_S` | these errors, and distances in units of the reference, of registered images after alignment |
 | `position_error_percent_S` | the distances in per cent of `reference_extent` |
 | `reference_extent`, `alignment_scale` | diagonal of the box around the reference's camera centres; scale of the alignment |
-| `reference`, `per_image` | only in the JSON file: path of the reference, and per image `rotation_error_deg`, `translation_angle_deg`, `position_error` |
+| `reference`, `per_image` | only in the JSON file: path of the reference, and per image, by its name in the model, `reference_name`, `rotation_error_deg`, `translation_angle_deg`, `position_error` |
 
 ## summary.json
 

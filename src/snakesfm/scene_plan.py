@@ -360,6 +360,8 @@ class ScenePlan:
             digests = {name: options_class(name)().digest() for name in PROVISIONAL_STAGES}
             distorts = self.configuration.adjust_bundle.refine_distortion
             return {"provisional": digests, "refine_distortion": distorts}
+        if stage == "average_translations":
+            return {"min_component_images": self.configuration.average_rotations.min_component_images}
         if stage == "adjust_bundle":
             model = self.configuration.index_images.camera_model
             return {"images": str(self.images), "intrinsics": inputs.intrinsics, "camera_model": model}

@@ -96,6 +96,7 @@ def test_other_bytes_of_what_a_front_end_reads_change_what_its_stage_is_told(
     [
         ("intrinsics", "refine", {"adjust_bundle", "export_model"}),
         ("index_images", {"camera_model": "OPENCV"}, {"index_images", "adjust_bundle"}),
+        ("average_rotations", {"min_component_images": 9}, {"average_rotations", "average_translations"}),
         ("blocks", 3, {"index_images", "select_pairs"}),
         ("seed", 1, set(STAGES)),
         ("device", "cpu", set()),

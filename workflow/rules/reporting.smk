@@ -9,6 +9,7 @@ rule render_report:
         graph=artifact("filter_view_graph", "graph.h5"),
         rotations=artifact("average_rotations", "rotations.h5"),
         tracks=artifact("build_tracks", "tracks.h5"),
+        centers=artifact("average_translations", "centers.h5"),
         points=artifact("triangulate_tracks", "points.h5"),
         reconstruction=artifact("adjust_bundle", "reconstruction.h5"),
         metrics=artifact("evaluate_model", "metrics.json"),

@@ -52,11 +52,16 @@ class CameraCenters(Artifact):
     """Averaged camera centres."""
 
     kind: ClassVar[str] = "camera_centers"
-    format_version: ClassVar[int] = 2
+    format_version: ClassVar[int] = 3
 
     centers: Array = column("(N,3)", "float64", "camera centre in the world; NaN where there is none")
+    components: Array = column(
+        "(N)", "int32", "images of one component share origin and scale; 0 the largest, -1 no centre"
+    )
     edge_residuals_deg: Array = column(
-        "(E)", "float64", "angle of the edge's direction to the centres, NaN for edges that took no part"
+        "(E)",
+        "float64",
+        "angle of the edge's direction to the centres, NaN for edges that took no part or join components",
     )
     ray_residuals_deg: Array = column("(Q)", "float64", "angle of each ray that took part to its landmark")
 

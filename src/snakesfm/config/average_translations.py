@@ -10,7 +10,7 @@ from snakesfm.config.base import StageOptions
 class AverageTranslationsOptions(StageOptions):
     """Options of positioning the cameras, their rotations being known."""
 
-    stage_version: ClassVar[int] = 10
+    stage_version: ClassVar[int] = 11
 
     method: Literal["scale_chain", "translation_recovery", "global_positioning"] = "scale_chain"
     """Initial positions: from baseline ratios of shared landmarks, gtsam's TranslationRecovery, or

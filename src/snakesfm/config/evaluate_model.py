@@ -12,7 +12,7 @@ Degrees = Annotated[float, Field(gt=0.0, le=180.0)]
 class EvaluateModelOptions(StageOptions):
     """Thresholds of the metrics."""
 
-    stage_version: ClassVar[int] = 5
+    stage_version: ClassVar[int] = 6
 
     relative_thresholds_deg: tuple[Degrees, ...] = Field(default=(1.0, 3.0, 5.0, 10.0, 20.0), min_length=1)
     """Thresholds of the AUC over the relative poses of all pairs of reference images, in degrees."""

@@ -10,7 +10,7 @@ from snakesfm.config.base import StageOptions
 class FilterViewGraphOptions(StageOptions):
     """Refusal of view-graph edges that contradict the others."""
 
-    stage_version: ClassVar[int] = 4
+    stage_version: ClassVar[int] = 5
 
     method: Literal["message_passing", "cycles"] = "message_passing"
     """How edges are judged by 3-cycles: message passing between cycles, or the two passes below."""

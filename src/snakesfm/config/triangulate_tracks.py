@@ -10,7 +10,7 @@ from snakesfm.config.base import StageOptions
 class TriangulateTracksOptions(StageOptions):
     """How tracks are triangulated."""
 
-    stage_version: ClassVar[int] = 2
+    stage_version: ClassVar[int] = 3
 
     method: Literal["ransac_dlt", "pycolmap"] = "ransac_dlt"
     """RANSAC over pairs of observations with a linear solution from the inliers, or pycolmap's

@@ -21,6 +21,8 @@ def main(arguments: list[str] | None = None) -> int:
     except SnakesfmError as error:
         sys.stderr.write(f"{error}\n")
         return 1
+    if evaluation.few_present:
+        sys.stderr.write(f"warning: {evaluation.few_present}\n")
     content: dict[str, object] = dict(metrics)
     if options.per_image:
         content["per_image"] = evaluation.per_image()

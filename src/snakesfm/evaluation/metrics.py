@@ -20,6 +20,11 @@ from snakesfm.image_names import match_names
 
 Metrics = dict[str, float | int | None]
 
+FEW_PRESENT = (
+    "only {present} of the {count} images of the reference were found by their names, and the others count "
+    "as not registered: call images as the reference does."
+)
+
 
 @dataclass(frozen=True)
 class Poses:
@@ -44,27 +49,36 @@ class Poses:
 class PoseEvaluation:
     """Metrics of a model's poses, and the errors of every scored image.
 
-    ``names`` are those of the scored reference images; ``rotation_deg``, ``position`` (reference units) and
-    ``direction_deg`` (angle between the position vectors from the reference's origin) are NaN where the
-    image is not registered.
+    ``names`` are those of the scored reference images, and ``model_names`` what the model calls them, or
+    the same where it lacks them; ``rotation_deg``, ``position`` (reference units) and ``direction_deg``
+    (angle between the position vectors from the reference's origin) are NaN where the image is not
+    registered.
     """
 
     metrics: Metrics
     names: list[str] = field(default_factory=list)
+    model_names: list[str] = field(default_factory=list)
     rotation_deg: Array = field(default_factory=lambda: np.zeros(0))
     position: Array = field(default_factory=lambda: np.zeros(0))
     direction_deg: Array = field(default_factory=lambda: np.zeros(0))
 
-    def per_image(self) -> dict[str, dict[str, float | None]]:
-        """The errors of every scored image by its name, None where it is not registered."""
+    @property
+    def few_present(self) -> str:
+        """What to say where the model lacks more than half of the reference's images, else empty."""
+        present, count = self.metrics["reference_images_present"], len(self.names)
+        return FEW_PRESENT.format(present=present, count=count) if 2 * (present or 0) < count else ""
+
+    def per_image(self) -> dict[str, dict[str, float | str | None]]:
+        """The errors of every scored image by its name in the model, None where it is not registered."""
         columns = {
             "rotation_error_deg": self.rotation_deg.tolist(),
             "translation_angle_deg": self.direction_deg.tolist(),
             "position_error": self.position.tolist(),
         }
         return {
-            name: {key: None if values[k] != values[k] else values[k] for key, values in columns.items()}
-            for k, name in enumerate(self.names)
+            name: {"reference_name": self.names[k]}
+            | {key: None if values[k] != values[k] else values[k] for key, values in columns.items()}
+            for k, name in enumerate(self.model_names)
         }
 
 
@@ -78,7 +92,8 @@ def evaluate_poses(
     """Compare a model's poses to reference poses.
 
     Images are matched by name; those that the reference lacks (or has without a pose) are not scored, and
-    scored images that the model lacks count as errors of 180 degrees.
+    scored images that the model lacks count as errors of 180 degrees. Where it has images, but none of the
+    reference's, names are not comparable, and there is no AUC.
 
     Parameters
     ----------
@@ -92,7 +107,8 @@ def evaluate_poses(
     known = reference.registered
     names = [name for name, is_known in zip(reference.names, known, strict=True) if is_known]
     truth = Poses(names, reference.rotations[known], reference.translations[known])
-    found, present = _in_order(model, names)
+    rows = match_names(model.names, names)
+    found, present = _in_order(model, names, rows), int(np.count_nonzero(rows >= 0))
     scored = found.registered
     extent = float(np.linalg.norm(np.ptp(truth.centers, axis=0))) if len(names) else 0.0
     min_baseline = min_baseline_ratio * extent
@@ -106,6 +122,8 @@ def evaluate_poses(
     metrics |= _relative_metrics(found, truth, min_baseline, relative_thresholds_deg)
     pose_errors = np.where(scored, np.maximum(rotation_deg, direction_deg), FAILED_DEG)
     metrics |= _auc_columns("pose_auc", pose_errors, global_thresholds_deg)
+    if len(model.names) and not present:
+        metrics |= dict.fromkeys((name for name in metrics if "_auc_" in name), None)
     metrics |= _distribution("rotation_error_deg", rotation_deg[scored])
     metrics |= _distribution("translation_angle_deg", direction_deg[scored])
     metrics |= _distribution("position_error", position[scored])
@@ -113,18 +131,18 @@ def evaluate_poses(
     metrics |= _distribution("position_error_percent", relative_position)
     metrics["reference_extent"] = extent
     metrics["alignment_scale"] = scale
-    return PoseEvaluation(metrics, names, rotation_deg, position, direction_deg)
+    model_names = [model.names[row] if row >= 0 else name for row, name in zip(rows, names, strict=True)]
+    return PoseEvaluation(metrics, names, model_names, rotation_deg, position, direction_deg)
 
 
-def _in_order(model: Poses, names: Sequence[str]) -> tuple[Poses, int]:
-    """The model's poses of these images, NaN where it lacks one, and how many it knows."""
-    rows = match_names(model.names, names)
+def _in_order(model: Poses, names: Sequence[str], rows: Array) -> Poses:
+    """The model's poses of these images, in its ``rows``, NaN where it lacks one (-1)."""
     present = rows >= 0
     rotations = np.full((len(names), 3, 3), np.nan)
     translations = np.full((len(names), 3), np.nan)
     rotations[present] = model.rotations[rows[present]]
     translations[present] = model.translations[rows[present]]
-    return Poses(names, rotations, translations), int(present.sum())
+    return Poses(names, rotations, translations)
 
 
 def _relative_metrics(
@@ -164,7 +182,9 @@ def _aligned_errors(
     return scale, rotation_deg, position, direction_deg
 
 
-def model_metrics(registered: Array, offsets: Array, errors_px: Array) -> Metrics:
+def model_metrics(
+    registered: Array, offsets: Array, errors_px: Array, measured: Array | None = None
+) -> Metrics:
     """The columns that need no truth.
 
     Parameters
@@ -172,11 +192,13 @@ def model_metrics(registered: Array, offsets: Array, errors_px: Array) -> Metric
     registered : (N,) bool, which images have a pose.
     offsets : (T+1,) int64, rows of the observations of each point.
     errors_px : (T,) float64, mean reprojection error of each point in pixels.
+    measured : (T,) int64, of how many observations that is the mean; None means all.
     """
     lengths = np.diff(offsets)
+    measured = lengths if measured is None else measured
     observations = int(lengths.sum())
     images = int(registered.sum())
-    some = observations > 0
+    some, with_error = observations > 0, bool(measured.any())
     return {
         "images": len(registered),
         "registered_images": images,
@@ -185,8 +207,8 @@ def model_metrics(registered: Array, offsets: Array, errors_px: Array) -> Metric
         "track_length_mean": float(lengths.mean()) if some else None,
         "track_length_median": float(np.median(lengths)) if some else None,
         "observations_per_image": observations / images if images else None,
-        "reprojection_error_px_mean": float(lengths @ errors_px / observations) if some else None,
-        "reprojection_error_px_median": float(np.median(errors_px)) if some else None,
+        "reprojection_error_px_mean": float(measured @ errors_px / measured.sum()) if with_error else None,
+        "reprojection_error_px_median": float(np.median(errors_px[measured > 0])) if with_error else None,
     }
 
 

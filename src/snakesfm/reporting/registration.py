@@ -15,7 +15,7 @@ class ImageCounts:
     ----------
     pairs, accepted, kept : (N,) int64, its pairs that were matched, accepted, kept by averaging.
     components : (N,) int32, component of the filtered view graph, 0 the largest.
-    rotated : (N,) bool, whether averaging gave it a rotation.
+    rotated, positioned : (N,) bool, whether averaging gave it a rotation and a position.
     track_observations, point_observations, observations : (N,) int64, its keypoints in tracks, in
         triangulated points, and in the first model.
     models : (N,) int32, the model it is in, -1 none.
@@ -27,6 +27,7 @@ class ImageCounts:
     kept: Array
     components: Array
     rotated: Array
+    positioned: Array
     track_observations: Array
     point_observations: Array
     models: Array
@@ -88,6 +89,8 @@ def reason_not_registered(
         return "Rotation averaging found no rotation for it."
     if counts.track_observations[image] == 0:
         return "It is in no track."
+    if not counts.positioned[image]:
+        return "Averaging found no position for it, and its matches to points of the model gave none."
     if counts.point_observations[image] == 0:
         return "None of its tracks could be triangulated."
     return "Bundle adjustment dropped it: too few of its observations agreed with the model."

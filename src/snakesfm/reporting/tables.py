@@ -111,7 +111,7 @@ def _words(name: str) -> str:
 def image_table(
     names: Sequence[str],
     counts: ImageCounts,
-    per_image: Mapping[str, Mapping[str, float | None]],
+    per_image: Mapping[str, Mapping[str, float | str | None]],
     most: int,
 ) -> tuple[list[str], list[list[Any]], str]:
     """Heads and rows of the table of images, and a note where it does not show all.

@@ -1,7 +1,7 @@
 """The interface of rotation averagers, and code that they share."""
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -39,6 +39,12 @@ class RotationGraph:
             self.weights[chosen],
             self.covariances[chosen],
         )
+
+    def restrict(self, nodes: Array) -> "RotationGraph":
+        """Some ``nodes`` (N,) bool, numbered from 0 in their order, with the edges between them."""
+        part = self.subset(np.asarray(nodes[self.pairs].all(axis=1)))
+        numbers = np.cumsum(nodes) - 1
+        return replace(part, node_count=int(np.count_nonzero(nodes)), pairs=numbers[part.pairs])
 
     def thin(self, degree: int) -> "RotationGraph":
         """The graph with about ``degree`` evenly spaced edges at every node that has more, if connected."""
@@ -92,16 +98,14 @@ class RotationAverager(ABC):
         rotations = np.asarray(rotations, dtype=np.float64).reshape(-1, 3, 3)
         _check(node_count, pairs, rotations)
         inside = label_components(node_count, pairs) == 0
-        chosen = inside[pairs[:, 0]]
-        numbers = np.cumsum(inside) - 1
         graph = RotationGraph(
-            int(inside.sum()),
-            numbers[pairs[chosen]],
-            rotations[chosen],
-            np.ones(int(chosen.sum())) if weights is None else np.maximum(weights, 1e-6)[chosen],
-            np.full((int(chosen.sum()), 3, 3), np.nan) if covariances is None else covariances[chosen],
+            node_count,
+            pairs,
+            rotations,
+            np.ones(len(pairs)) if weights is None else np.maximum(weights, 1e-6),
+            np.full((len(pairs), 3, 3), np.nan) if covariances is None else covariances,
         )
-        solved = self.solve(graph)
+        solved = self.solve(graph.restrict(inside))
         averaged = np.full((node_count, 3, 3), np.nan)
         averaged[inside] = solved @ solved[0].T
         averaged[np.flatnonzero(inside)[0]] = np.eye(3)

@@ -1,7 +1,5 @@
 """Averaging of a filtered view graph; all edges, refused ones included, are then tested again."""
 
-from dataclasses import replace
-
 import numpy as np
 
 from snakesfm.arrays import Array
@@ -46,11 +44,8 @@ def average_rotation_components(
         if np.count_nonzero(largest) < (min_images if tried.any() else 2):
             return rotations, judged, components
         inside = largest[graph.pairs].all(axis=1)
-        numbers = np.cumsum(largest) - 1
-        part = graph.subset(inside)
-        part = replace(part, node_count=int(largest.sum()), pairs=numbers[part.pairs])
         averaged, left, labels = average_view_graph(
-            averager, part, reasons[inside], smallest_limit_deg, largest_limit_deg
+            averager, graph.restrict(largest), reasons[inside], smallest_limit_deg, largest_limit_deg
         )
         images = np.flatnonzero(largest)[labels == 0]
         if len(images) >= min_images or not tried.any():
@@ -114,10 +109,7 @@ def average_view_graph(
 def _improve_on_all(graph: RotationGraph, rotations: Array) -> Array:
     """Rotations (N,3,3) that suit all edges between nodes with a rotation better."""
     known = np.isfinite(rotations[:, 0, 0])
-    numbers = np.cumsum(known) - 1
-    inside = np.asarray(known[graph.pairs].all(axis=1))
-    part = graph.subset(inside)
-    part = replace(part, node_count=int(known.sum()), pairs=numbers[part.pairs])
+    part = graph.restrict(known).thin(SEARCH_DEGREE)
     improved = rotations.copy()
-    improved[known] = improve_rotations(IrlsAverager(), part.thin(SEARCH_DEGREE), rotations[known])
+    improved[known] = improve_rotations(IrlsAverager(), part, rotations[known])
     return improved

@@ -59,13 +59,13 @@ def run(job: StageJob) -> None:
     """
     index = ImageIndex.read(job.path("index"))
     originals = cameras_from_columns(*CalibratedCameras.read(job.path("cameras")).camera_columns)
-    averaged = CameraRotations.read(job.path("rotations"))
-    centers = CameraCenters.read(job.path("centers")).centers
+    rotations = CameraRotations.read(job.path("rotations")).rotations
+    averaged = CameraCenters.read(job.path("centers"))
     poses = BundleModel(
         tuple(reduce_cameras(originals, job.settings)),
         index.camera_ids,
-        averaged.rotations,
-        translation_of(averaged.rotations, centers),
+        rotations,
+        translation_of(rotations, averaged.centers),
         points=np.zeros((0, 3)),
         offsets=np.zeros(1, np.int64),
         image_ids=np.zeros(0, np.int32),
@@ -82,11 +82,11 @@ def run(job: StageJob) -> None:
     for component in range(int(averaged.components.max(initial=0)) + 1):
         mine = (averaged.components == component) & ~taken
         part = restrict_to(replace(poses, cameras=cameras), mine)
-        posed, least = int(part.registered.sum()), SMALLEST_FURTHER_MODEL if component else 2
-        if posed < least:
+        least = SMALLEST_FURTHER_MODEL if component else 2
+        if mine.sum() < least:
             if mine.any():
                 print(
-                    f"part {component + 1} is left out: {posed} of its {mine.sum()} images have a pose, "
+                    f"part {component + 1} is left out: {mine.sum()} of its images are in no other model, "
                     f"and a model needs {least}",
                     flush=True,
                 )

@@ -32,16 +32,21 @@ if TYPE_CHECKING:
     from snakesfm.config.average_translations import AverageTranslationsOptions
 
 DOUBTFUL = (
-    "only {percent:.0f} % of the rays agree with the camera positions: the model may be folded, as happens "
-    "where parts of the scene look alike; check it, or add images in between."
+    "only {percent:.0f} % of the rays agree with the positions of {count} cameras: the model may be "
+    "folded, as happens where parts of the scene look alike, or lack cameras; check it, or add images in "
+    "between."
 )
+# average_rotations.min_component_images, where nobody says what it is
+USUAL_COMPONENT_IMAGES = 5
 
 
 def run(job: StageJob) -> None:
     """Position the images that have a rotation, each component in its own coordinate frame.
 
-    Edges take part that every filter kept and whose translation has a direction; rays of the tracks take
-    part as far as ``rays_per_camera`` allows.
+    A component of the rotations may fall into several, if nothing tells their relative size.
+
+    Edges take part that rotation averaging kept and whose translation has a direction; rays of the tracks
+    take part as far as ``rays_per_camera`` allows.
 
     Raises
     ------
@@ -55,26 +60,30 @@ def run(job: StageJob) -> None:
     tracks = TrackTable.read(job.path("tracks"))
     problem, usable = _problem(index, cameras, graph, averaged, tracks)
     settings = positioning_settings(options, job.seed_for("positions"))
-    result = position_components(problem, averaged.components, settings)
-    placed = int(np.isfinite(result.centers[:, 0]).sum())
+    least = int(job.settings.get("min_component_images", USUAL_COMPONENT_IMAGES))
+    result = position_components(problem, averaged.components, settings, least)
+    sizes = np.bincount(result.components[result.components >= 0])
+    placed = int(sizes.sum())
     if placed < 2:
         raise SceneError(
             f"Scene '{job.scene}': no two images could be positioned from {len(problem.pairs)} image pairs "
             f"and {len(tracks.offsets) - 1} tracks: add images from different positions with more overlap, "
             "or mask borders and captions that all images share."
         )
-    agreeing = result.ray_residuals_rad < settings.limits.ray_rad
-    if np.count_nonzero(agreeing) < DOUBTFUL_SHARE * len(agreeing):
-        job.warn(DOUBTFUL.format(percent=100 * np.mean(agreeing)))
+    for count, agreeing in zip(sizes.tolist(), result.agreeing, strict=True):
+        if agreeing < DOUBTFUL_SHARE:
+            job.warn(DOUBTFUL.format(percent=100 * agreeing, count=count))
     edges_deg, rays_deg = np.full(len(graph.pairs), np.nan), np.degrees(result.ray_residuals_rad)
     edges_deg[usable] = np.degrees(result.edge_residuals_rad)
     turned = int(np.isfinite(averaged.rotations[:, 0, 0]).sum())
+    frames = f" in frames of {', '.join(map(str, sizes))} images" if len(sizes) > 1 else ""
     print(
-        f"{placed} of {turned} images with a rotation are positioned; median residuals: edges "
+        f"{placed} of {turned} images with a rotation are positioned{frames}; median residuals: edges "
         f"{_median(edges_deg):.2f} deg, rays {_median(rays_deg):.2f} deg"
     )
     CameraCenters(
         centers=result.centers,
+        components=result.components,
         edge_residuals_deg=edges_deg,
         ray_residuals_deg=rays_deg,
     ).write(job.output, job.header)
@@ -89,7 +98,7 @@ def _problem(
 ) -> tuple[PositioningProblem, Array]:
     """What images with a rotation tell of their positions, and which edges (E,) bool take part."""
     turned = np.isfinite(averaged.rotations[:, 0, 0])
-    usable = (graph.labels == 0) & (averaged.labels == 0) & turned[graph.pairs].all(axis=1)
+    usable = (averaged.labels == 0) & turned[graph.pairs].all(axis=1)
     usable &= (graph.kinds != KINDS.index("rotation_only")) & np.isfinite(graph.translations[:, 0])
     # a part that a look-alike joined to a track is a landmark of its own: positioning cannot throw out rays
     by_part = np.argsort(tracks.part_ids, kind="stable")

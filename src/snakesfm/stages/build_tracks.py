@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 def run(job: StageJob) -> None:
-    """Join the matches of edges that every filter kept, between images that have a rotation.
+    """Join the matches of edges that rotation averaging kept, between images that have a rotation.
 
     Raises
     ------
@@ -34,7 +34,7 @@ def run(job: StageJob) -> None:
     graph = ViewGraph.read(job.path("graph"))
     rotations = CameraRotations.read(job.path("rotations"))
     registered = np.isfinite(rotations.rotations[:, 0, 0])
-    kept = (graph.labels == 0) & (rotations.labels == 0) & registered[graph.pairs].all(axis=1)
+    kept = (rotations.labels == 0) & registered[graph.pairs].all(axis=1)
     keypoints, colors = gather_image_columns(job.paths("features"), len(index.names), "keypoints", "colors")
     pairs, offsets, matches = gather_inlier_matches(job.paths("geometries"), graph.pairs[kept])
     min_length = min(options.min_length, max(2, int(registered.sum())))

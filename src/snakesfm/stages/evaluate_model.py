@@ -30,6 +30,8 @@ def run(job: StageJob) -> None:
         options: EvaluateModelOptions = job.options
         known = model_poses(read_model(Path(reference).expanduser()))
         evaluation = evaluate_poses(poses, known, **options.model_dump())
+        if evaluation.few_present:
+            job.warn(evaluation.few_present)
         row |= evaluation.metrics
         content = {**row, "reference": reference, "per_image": evaluation.per_image()}
     for path in job.outputs:

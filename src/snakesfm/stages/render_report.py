@@ -13,6 +13,7 @@ import snakesfm
 from snakesfm.arrays import Array
 from snakesfm.artifacts import (
     CalibratedCameras,
+    CameraCenters,
     CameraRotations,
     ImageIndex,
     Reconstruction,
@@ -72,6 +73,7 @@ def run(job: StageJob) -> None:
     rotations = CameraRotations.read(job.path("rotations"))
     pairs = _read_pairs(job.paths("geometries"))
     tracks = _read_columns(TrackTable, job.path("tracks"), TRACK_COLUMNS)
+    positioned = _read_columns(CameraCenters, job.path("centers"), ("components",))["components"] >= 0
     points = _read_columns(TriangulatedPoints, job.path("points"), ("offsets", "image_ids"))
     metrics = json.loads(job.path("metrics").read_text("utf-8"))
     summary = json.loads(job.path("summary").read_text("utf-8")) if "summary" in job.inputs else {}
@@ -90,7 +92,7 @@ def run(job: StageJob) -> None:
         model.image_ids,
         model.keypoints,
     )
-    counts = _counts(adjusted.models, model, errors, pairs, graph, rotations, tracks, points)
+    counts = _counts(adjusted.models, model, errors, pairs, graph, rotations, positioned, tracks, points)
     seconds = stage_costs(path.read_text("utf-8", errors="replace") for path in logs)
     heads, rows, note = image_table(names, counts, metrics.get("per_image", {}), job.options.max_images)
     registered = np.flatnonzero(counts.registered)
@@ -125,10 +127,14 @@ def _counts(
     pairs: Pairs,
     graph: ViewGraph,
     rotations: CameraRotations,
+    positioned: Array,
     tracks: Mapping[str, Array],
     points: Mapping[str, Array],
 ) -> ImageCounts:
-    """What each stage kept of every image; ``models`` is the model (N,) that each is in."""
+    """What each stage kept of every image; ``models`` is the model (N,) that each is in.
+
+    ``positioned`` (N,) bool says which have a centre.
+    """
     count = len(models)
     return ImageCounts(
         pairs=count_by_image(pairs.pairs, count),
@@ -136,6 +142,7 @@ def _counts(
         kept=count_by_image(graph.pairs[rotations.labels == 0], count),
         components=graph.components,
         rotated=np.asarray(np.isfinite(rotations.rotations).all(axis=(1, 2))),
+        positioned=positioned,
         track_observations=count_by_image(tracks["image_ids"], count),
         point_observations=count_by_image(points["image_ids"], count),
         models=models,
@@ -250,6 +257,7 @@ def _stage_rows(
         "filter_view_graph": f"{int(np.sum(graph.labels == 0)):,} of {len(graph.labels):,} edges kept; "
         f"largest component {int(sizes[0]) if len(sizes) else 0:,} images",
         "average_rotations": f"{int(counts.rotated.sum()):,} images have a rotation{residual}",
+        "average_translations": f"{int(counts.positioned.sum()):,} images have a position",
         "build_tracks": f"{len(tracks['offsets']) - 1:,} tracks, {len(tracks['image_ids']):,} keypoints",
         "triangulate_tracks": f"{len(points['offsets']) - 1:,} points, "
         f"{len(points['image_ids']):,} observations",

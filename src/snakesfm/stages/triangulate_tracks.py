@@ -1,5 +1,6 @@
 """Stage triangulate_tracks: points from tracks and averaged poses."""
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -23,7 +24,7 @@ LEAST_SHARE = 0.02
 
 
 def run(job: StageJob) -> None:
-    """Triangulate every track between images that have a rotation and a centre.
+    """Triangulate every track between images that have a rotation and a centre, in each frame by itself.
 
     Raises
     ------
@@ -33,10 +34,10 @@ def run(job: StageJob) -> None:
     index = ImageIndex.read(job.path("index"))
     cameras = cameras_from_columns(*CalibratedCameras.read(job.path("cameras")).camera_columns)
     rotations = CameraRotations.read(job.path("rotations")).rotations
-    centers = CameraCenters.read(job.path("centers")).centers
-    tracks = TrackTable.read(job.path("tracks"))
+    averaged = CameraCenters.read(job.path("centers"))
+    tracks = split_by_frame(TrackTable.read(job.path("tracks")), averaged.components)
     scales = detector_scales(index.sizes, job.settings).astype(np.float32)
-    translations = translation_of(rotations, centers)
+    translations = translation_of(rotations, averaged.centers)
     points, kept = triangulate_tracks(
         reduce_cameras(cameras, job.settings),
         index.camera_ids,
@@ -82,3 +83,21 @@ def run(job: StageJob) -> None:
         keypoints=tracks.keypoints[kept],
         colors=mean_colors(tracks.colors[kept], offsets),
     ).write(job.output, job.header)
+
+
+def split_by_frame(tracks: TrackTable, components: np.ndarray) -> TrackTable:
+    """Tracks of images of several components (N,), each a coordinate frame, as one for each of them."""
+    track_of = np.repeat(np.arange(len(tracks.offsets) - 1), np.diff(tracks.offsets))
+    # images without a centre tell nothing, so they need no track of their own
+    frames = np.maximum(components, 0)[tracks.image_ids]
+    order = np.lexsort((frames, track_of))
+    changes = (np.diff(track_of[order]) != 0) | (np.diff(frames[order]) != 0)
+    return replace(
+        tracks,
+        offsets=np.r_[0, np.flatnonzero(changes) + 1, len(order)] if len(order) else tracks.offsets,
+        image_ids=tracks.image_ids[order],
+        keypoint_ids=tracks.keypoint_ids[order],
+        part_ids=tracks.part_ids[order],
+        keypoints=tracks.keypoints[order],
+        colors=tracks.colors[order],
+    )

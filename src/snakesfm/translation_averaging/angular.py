@@ -8,7 +8,7 @@ import numpy as np
 from snakesfm.arrays import Array
 from snakesfm.geometry.sparse_systems import solve_spd
 from snakesfm.grouping import sum_by
-from snakesfm.translation_averaging.landmarks import intersect, perpendicular
+from snakesfm.translation_averaging.landmarks import locate_landmarks, perpendicular
 from snakesfm.translation_averaging.problem import PositioningProblem
 
 FACTORED_UNKNOWNS = 900
@@ -98,15 +98,14 @@ def refine_angles(problem: PositioningProblem, centers: Array, scale_rad: float)
     problem = problem.select_edges(known[problem.pairs[:, 0]] & known[problem.pairs[:, 1]]).select_rays(
         known[problem.ray_images]
     )
-    track_count = int(problem.ray_tracks.max(initial=-1)) + 1
-    points = intersect(centers[problem.ray_images], problem.rays, problem.ray_tracks, track_count)
+    points = locate_landmarks(problem, centers)
     problem = problem.select_rays(np.isfinite(points[problem.ray_tracks, 0]))
     images = problem.images()
     problem, owners = _cut_landmarks(problem)
     place, spots = _descend(_layout(problem, images), centers[images], points[owners], scale_rad)
     result = np.full_like(centers, np.nan)
     result[images] = place
-    landmarks = np.full((track_count, 3), np.nan)
+    landmarks = np.full_like(points, np.nan)
     landmarks[owners[::-1]] = spots[::-1]
     return result, landmarks
 

@@ -1,6 +1,6 @@
 """From directions to checked centres: first guess, refinement, weak cameras, gauge, residuals."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -8,7 +8,7 @@ from snakesfm.arrays import Array
 from snakesfm.grouping import components_of
 from snakesfm.translation_averaging.angular import refine_angles
 from snakesfm.translation_averaging.averagers import GlobalPositioning, TranslationAverager, with_rays
-from snakesfm.translation_averaging.landmarks import angles_rad, edge_angles_rad, intersect
+from snakesfm.translation_averaging.landmarks import angles_rad, edge_angles_rad, locate_landmarks
 from snakesfm.translation_averaging.problem import PositioningProblem
 from snakesfm.translation_averaging.support import SupportLimits, attach_cameras, held_cameras
 
@@ -17,8 +17,8 @@ DOUBTFUL_SHARE = 0.75
 # positions with which fewer agree are no better than none
 LEAST_SHARE = 0.6
 MORE_RAYS = 15
-# in all: global positioning takes a few seconds for so many
-MOST_RAYS = 500_000
+# in all: global positioning takes most of a minute for so many, and is tried several times
+MOST_RAYS = 200_000
 
 
 @dataclass(frozen=True)
@@ -54,25 +54,99 @@ class AveragedCenters:
     edge_residuals_rad: Array
     """(E) NaN where a centre is missing."""
     ray_residuals_rad: Array
-    """(Q) of the rays that took part."""
+    """(Q) of the rays that took part, NaN where a centre is missing."""
+    ray_images: Array
+    """(Q)."""
+
+    @property
+    def placed(self) -> Array:
+        """Which images (N,) bool have a centre."""
+        return np.isfinite(self.centers[:, 0])
+
+
+@dataclass(frozen=True)
+class PositionedComponents:
+    """Centres of N cameras in frames of C components, and how well E edges and Q rays agree with them."""
+
+    centers: Array
+    """(N,3), NaN where there is none; each component as of :class:`AveragedCenters`."""
+    components: Array
+    """(N,) int32 of the images with a centre, 0 the largest; -1 for others."""
+    edge_residuals_rad: Array
+    """(E) NaN where a centre is missing, and between components."""
+    ray_residuals_rad: Array
+    """(Q) of the rays that took part and whose image has a centre."""
+    agreeing: tuple[float, ...]
+    """(C) share of the rays that agree; those of images that were left out do not."""
 
 
 def position_components(
-    problem: PositioningProblem, components: Array, settings: PositioningSettings
-) -> AveragedCenters:
-    """Position the cameras of each component (N,) of the images, -1 for none, in its own frame."""
-    centers = np.full((problem.image_count, 3), np.nan)
-    edge_residuals = np.full(len(problem.pairs), np.nan)
-    rays = []
-    for component in range(max(1, int(components.max(initial=-1)) + 1)):
+    problem: PositioningProblem, components: Array, settings: PositioningSettings, min_images: int
+) -> PositionedComponents:
+    """Position the cameras of each component (N,) of the images, -1 for none, in its own frame.
+
+    What gets no centre there is tried as a component of its own: parts of a scene that hang together by
+    photographs from one place have scales of their own.
+
+    Parameters
+    ----------
+    min_images : images that such a further component must have.
+    """
+    parts: list[tuple[AveragedCenters, float]] = []
+    for component in range(int(components.max(initial=-1)) + 1):
         mine = components == component
-        edges = mine[problem.pairs].all(axis=1)
-        part = problem.select_edges(edges).select_rays(mine[problem.ray_images])
-        found = average_translations(part, settings)
-        centers[mine] = found.centers[mine]
-        edge_residuals[edges] = found.edge_residuals_rad
-        rays.append(found.ray_residuals_rad)
-    return AveragedCenters(centers, edge_residuals, np.concatenate(rays))
+        found = _position_parts(problem, mine, replace(settings, restarts=0), min_images)
+        if settings.restarts and found[0][1] < DOUBTFUL_SHARE:
+            found = _position_parts(problem, mine, settings, min_images)
+        parts += [part for part in found if part[0].placed.any()]
+    parts.sort(key=lambda part: -np.count_nonzero(part[0].placed))
+    centers, labels = np.full((problem.image_count, 3), np.nan), np.full(problem.image_count, -1, np.int32)
+    edge_residuals, rays = np.full(len(problem.pairs), np.nan), [np.zeros(0)]
+    for number, (part, _) in enumerate(parts):
+        centers[part.placed], labels[part.placed] = part.centers[part.placed], number
+        of_part = np.asarray(part.placed[problem.pairs].all(axis=1))
+        edge_residuals[of_part] = edge_angles_rad(problem.select_edges(of_part), part.centers)
+        rays.append(part.ray_residuals_rad[np.isfinite(part.ray_residuals_rad)])
+    agreeing = tuple(share for _, share in parts)
+    return PositionedComponents(centers, labels, edge_residuals, np.concatenate(rays), agreeing)
+
+
+def _position_parts(
+    problem: PositioningProblem, mine: Array, settings: PositioningSettings, min_images: int
+) -> list[tuple[AveragedCenters, float]]:
+    """The largest part of images (N,) bool, then others, each with the share of the rays that agree.
+
+    Images that are in no part count against the first one.
+    """
+    first = average_translations(problem.select_images(mine), settings)
+    further = _further_parts(problem, mine & ~first.placed, settings, min_images)
+    elsewhere = np.zeros(problem.image_count, dtype=bool)
+    for part, _ in further:
+        elsewhere |= part.placed
+    rays = first.ray_residuals_rad[~elsewhere[first.ray_images]]
+    return [(first, _share(rays, settings.limits)), *further]
+
+
+def _further_parts(
+    problem: PositioningProblem, left: Array, settings: PositioningSettings, min_images: int
+) -> list[tuple[AveragedCenters, float]]:
+    """Parts among images (N,) bool that were left out of one: rays alone hold them in place.
+
+    Edges are too little evidence here: these images may as well belong to the model that left them out.
+    """
+    settings = replace(settings, restarts=0, limits=replace(settings.limits, edge_rad=0.0))
+    left = left.copy()
+    parts: list[tuple[AveragedCenters, float]] = []
+    while True:
+        rest = largest_part(problem.select_images(left))
+        images = rest.images()
+        if len(images) < min_images:
+            return parts
+        part = average_translations(rest, settings)
+        share = _share(part.ray_residuals_rad[part.placed[part.ray_images]], settings.limits)
+        if np.count_nonzero(part.placed) >= min_images and share >= DOUBTFUL_SHARE:
+            parts.append((part, share))
+        left[part.placed if part.placed.any() else images] = False
 
 
 def average_translations(problem: PositioningProblem, settings: PositioningSettings) -> AveragedCenters:
@@ -107,17 +181,20 @@ def average_translations(problem: PositioningProblem, settings: PositioningSetti
             best = max(agreeing_share(whole, centers, limits), LEAST_SHARE)
             for start in range(settings.restarts):
                 other = settings.restart.position(more, settings.seed + start)
+                # cameras that were left out may have scales of their own
+                other = np.where(np.isfinite(first), other, np.nan)
                 other = _checked_positions(more, other, settings)
                 share = agreeing_share(whole, other, limits)
                 if share > best:
                     chosen, centers, best = more, other, share
+                if best >= DOUBTFUL_SHARE:
+                    break
     centers = normalize_gauge(part, centers)
-    seen = chosen.select_rays(np.isfinite(centers[chosen.ray_images, 0]))
-    points = _landmarks(seen, centers)
     return AveragedCenters(
         centers=centers,
         edge_residuals_rad=edge_angles_rad(problem, centers),
-        ray_residuals_rad=angles_rad(seen, centers, points),
+        ray_residuals_rad=angles_rad(chosen, centers, locate_landmarks(chosen, centers)),
+        ray_images=chosen.ray_images,
     )
 
 
@@ -126,12 +203,7 @@ def agreeing_share(problem: PositioningProblem, centers: Array, limits: SupportL
 
     Rays of images without a centre do not; the share of no rays is 1.
     """
-    known = np.isfinite(centers[problem.ray_images, 0])
-    if not known.any():
-        return float(not len(known))
-    seen = problem.select_rays(known)
-    angles = angles_rad(seen, centers, _landmarks(seen, centers))
-    return float(np.count_nonzero(angles < limits.ray_rad) / len(known))
+    return _share(angles_rad(problem, centers, locate_landmarks(problem, centers)), limits)
 
 
 def largest_part(problem: PositioningProblem) -> PositioningProblem:
@@ -167,9 +239,9 @@ def _checked_positions(problem: PositioningProblem, centers: Array, settings: Po
     return checked
 
 
-def _landmarks(problem: PositioningProblem, centers: Array) -> Array:
-    size = int(problem.ray_tracks.max(initial=-1)) + 1
-    return intersect(centers[problem.ray_images], problem.rays, problem.ray_tracks, size)
+def _share(angles: Array, limits: SupportLimits) -> float:
+    """Share of the rays whose angles (Q) are within the limit; NaN ones are not, and that of none is 1."""
+    return float(np.mean(angles < limits.ray_rad)) if len(angles) else 1.0
 
 
 def _refined(problem: PositioningProblem, centers: Array, settings: PositioningSettings) -> Array:
@@ -181,11 +253,7 @@ def _checked(
     problem: PositioningProblem, centers: Array, limits: SupportLimits, attach: bool = True
 ) -> Array:
     known = np.isfinite(centers[:, 0])
-    points = _landmarks(problem.select_rays(known[problem.ray_images]), centers)
-    # Rays of images without centre may point to higher tracks than the triangulated ones.
-    size = int(problem.ray_tracks.max(initial=-1)) + 1
-    points = np.concatenate([points, np.full((size - len(points), 3), np.nan)])
-    held = known & held_cameras(problem, centers, points, limits)
+    held = known & held_cameras(problem, centers, locate_landmarks(problem, centers), limits)
     if attach:
         return attach_cameras(problem, centers, held, limits)
     return np.where(held[:, None], centers, np.nan)

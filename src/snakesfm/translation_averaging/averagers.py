@@ -31,7 +31,7 @@ class ScaleChain:
     """Baselines compared through shared landmarks, then linear; see :mod:`scale_chain`.
 
     Draws nothing at random. Where too few landmarks are shared to link most cameras, ``fallback`` is used
-    instead.
+    instead, but for cameras in parts that nothing ties to the largest: it would give those any scale.
     """
 
     sigma_rad: float
@@ -40,13 +40,19 @@ class ScaleChain:
 
     def position(self, problem: PositioningProblem, seed: int) -> Array:
         """See :class:`TranslationAverager`."""
-        centers = self.link(problem)
-        return self.fallback.position(problem, seed) if centers is None else centers
+        centers, apart = self.link(problem)
+        if centers is None:
+            return np.where(apart[:, None], np.nan, self.fallback.position(problem, seed))
+        return centers
 
-    def link(self, problem: PositioningProblem) -> Array | None:
-        """Centres (N,3), or None where the landmarks link fewer than half of the cameras."""
-        centers = chain_centers(problem, 1.5 * self.sigma_rad, self.max_relative_sigma)
-        return None if 2 * np.isfinite(centers[:, 0]).sum() < len(problem.images()) else centers
+    def link(self, problem: PositioningProblem) -> tuple[Array | None, Array]:
+        """Centres (N,3), or None where the landmarks link fewer than half of the cameras.
+
+        Also which cameras (N,) bool have scales of their own.
+        """
+        centers, apart = chain_centers(problem, 1.5 * self.sigma_rad, self.max_relative_sigma)
+        few = 2 * np.isfinite(centers[:, 0]).sum() < len(problem.images())
+        return (None if few else centers), apart
 
 
 @dataclass(frozen=True)
@@ -80,9 +86,11 @@ class TranslationRecovery:
             keep = ~(edge_angles_rad(problem, centers) > self.residual_rad)
             if not keep.all():
                 centers = recover_translations(problem.select_edges(keep), self.sigma, seed)
-        chained = self.chain.link(whole) if self.chain else None
-        if chained is None:
+        if self.chain is None:
             return centers
+        chained, apart = self.chain.link(whole)
+        if chained is None:
+            return np.where(apart[:, None], np.nan, centers)
         share = share_at_one_scale(whole.pairs, centers, chained)
         if share >= LEAST_SHARE_AT_ONE_SCALE:
             return centers

@@ -24,8 +24,8 @@ LARGEST_CONDITION = 1e14
 
 def join_by_edges(
     problem: PositioningProblem, clusters: Sequence[Array], max_relative_sigma: float
-) -> Array:
-    """Centres (N,3) of the first cluster and of all that shared cameras and edges tie to it.
+) -> tuple[Array, list[Array]]:
+    """Centres (N,3) of the first cluster and of all that shared cameras and edges tie to it; the others.
 
     Parameters
     ----------
@@ -48,7 +48,7 @@ def join_by_edges(
             else:
                 centers = np.where(np.isfinite(centers), centers, placed)
         waiting = left
-    return centers
+    return centers, waiting
 
 
 @dataclass(frozen=True)

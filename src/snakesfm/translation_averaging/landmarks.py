@@ -62,6 +62,13 @@ def intersect(origins: Array, rays: Array, groups: Array, count: int, rounds: in
     return points
 
 
+def locate_landmarks(problem: PositioningProblem, centers: Array) -> Array:
+    """Landmarks (max track + 1, 3) from the rays of cameras with a centre; NaN where these do not tell."""
+    seen = problem.select_rays(np.isfinite(centers[problem.ray_images, 0]))
+    size = int(problem.ray_tracks.max(initial=-1)) + 1
+    return intersect(centers[seen.ray_images], seen.rays, seen.ray_tracks, size)
+
+
 def angles_rad(problem: PositioningProblem, centers: Array, points: Array) -> Array:
     """Angles (Q) between the rays and the directions to their landmarks ``points[ray_tracks]``."""
     offsets = points[problem.ray_tracks] - centers[problem.ray_images]

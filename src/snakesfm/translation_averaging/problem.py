@@ -54,6 +54,11 @@ class PositioningProblem:
             self.rays,
         )
 
+    def select_images(self, images: Array) -> "PositioningProblem":
+        """The same problem with the rays of some images (N,) bool and the edges between them."""
+        inside = np.asarray(images[self.pairs].all(axis=1))
+        return self.select_edges(inside).select_rays(images[self.ray_images])
+
     def number_tracks(self) -> tuple["PositioningProblem", Array]:
         """The same problem with the tracks that occur numbered from 0, and the former number of each."""
         tracks, rows = np.unique(self.ray_tracks, return_inverse=True)

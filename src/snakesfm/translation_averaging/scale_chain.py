@@ -14,6 +14,7 @@ from snakesfm.geometry.sparse_systems import solve_spd
 from snakesfm.grouping import components_of, offsets_of, sum_by
 from snakesfm.translation_averaging.clusters import join_by_edges
 from snakesfm.translation_averaging.problem import PositioningProblem
+from snakesfm.view_graph.components import label_components
 
 FIRST_SCALE = 16.0
 IRLS_ROUNDS = 12
@@ -122,10 +123,11 @@ def chain_centers(
     scale_rad: float,
     max_relative_sigma: float,
     edges_per_camera: int = 8,
-) -> Array:
+) -> tuple[Array, Array]:
     """Centres (N,3) from the baselines of the edges; NaN where an image hangs on no edge that has one.
 
     Parts whose baselines no landmark compares with those of the largest are joined to it by their edges.
+    Also which images (N,) bool are in parts that this does not join: of those no scale is known.
 
     Parameters
     ----------
@@ -162,9 +164,13 @@ def chain_centers(
         )
         linked = np.flatnonzero(taken & np.isfinite(baselines))
         found.append(_link(problem, directions, np.exp(baselines), firmness, linked))
+    apart = np.zeros(problem.image_count, dtype=bool)
     if not found:
-        return np.full((problem.image_count, 3), np.nan)
-    return join_by_edges(replace(problem, directions=directions), found, max_relative_sigma)
+        return np.full((problem.image_count, 3), np.nan), apart
+    centers, others = join_by_edges(replace(problem, directions=directions), found, max_relative_sigma)
+    for cluster in others:
+        apart |= np.isfinite(cluster[:, 0]) & ~np.isfinite(centers[:, 0])
+    return centers, apart
 
 
 def _comparable_parts(edges: Array, rows: Array, edge_count: int, row_count: int) -> list[Array]:
@@ -243,8 +249,7 @@ def _link(
     centers = np.full((count, 3), np.nan)
     if len(taken) == 0:
         return centers
-    labels = components_of(count, problem.pairs[taken])
-    main = labels == np.argmax(np.bincount(labels))
+    main = label_components(count, problem.pairs[taken]) == 0
     taken = taken[main[problem.pairs[taken, 0]]]
     names, ends = np.unique(problem.pairs[taken], return_inverse=True)
     ends = ends.reshape(-1, 2)

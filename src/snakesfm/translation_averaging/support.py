@@ -10,6 +10,7 @@ from snakesfm.translation_averaging.landmarks import (
     angles_rad,
     edge_angles_rad,
     intersect,
+    locate_landmarks,
     perpendicular,
     usual_error_rad,
 )
@@ -126,13 +127,9 @@ def attach_cameras(
     waiting = np.zeros(problem.image_count, dtype=bool)
     waiting[problem.images()] = True
     waiting &= ~held
-    for _ in range(problem.image_count):
-        if not waiting.any() or waiting.all():
-            break
+    points = locate_landmarks(problem, centers)
+    while waiting.any() and not waiting.all():
         known = np.isfinite(centers[:, 0])
-        seen = problem.select_rays(known[problem.ray_images])
-        size = int(problem.ray_tracks.max(initial=-1)) + 1
-        points = intersect(centers[seen.ray_images], seen.rays, seen.ray_tracks, size)
         rays = waiting[problem.ray_images] & np.isfinite(points[problem.ray_tracks, 0])
         forth = waiting[problem.pairs[:, 1]] & known[problem.pairs[:, 0]]
         back = waiting[problem.pairs[:, 0]] & known[problem.pairs[:, 1]]
@@ -152,4 +149,8 @@ def attach_cameras(
             break
         centers[good] = trial[good]
         waiting &= ~good
+        # landmarks that no new camera sees stay where they are: a chain of cameras takes a pass for each
+        seen = np.isin(problem.ray_tracks, problem.ray_tracks[good[problem.ray_images]])
+        again, tracks = problem.select_rays(seen).number_tracks()
+        points[tracks] = locate_landmarks(again, centers)
     return centers

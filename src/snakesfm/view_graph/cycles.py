@@ -29,16 +29,13 @@ class Cycles:
     edges : (T,3) int32, rows of the edges (i, j), (j, k) and (i, k).
     errors : (T,) float32, angle in radians of R_ik^T R_jk R_ij.
     smallest : (E,) float64, smallest error of an edge's cycles in radians, NaN in no cycle.
+    per_edge : how many cycles an edge of the graph is in on average, those that were not tried included.
     """
 
     edges: Array
     errors: Array
     smallest: Array
-
-    @property
-    def per_edge(self) -> float:
-        """How many cycles an edge is in on average."""
-        return 3 * len(self.edges) / max(len(self.smallest), 1)
+    per_edge: float
 
 
 def find_cycles(
@@ -62,9 +59,10 @@ def find_cycles(
     sample = int(
         np.clip(TRIED // max(edge_count, 1), min(FEWEST_TRIED_PER_EDGE, tried_per_edge), tried_per_edge)
     )
-    keys = [np.zeros(0, dtype=np.int64)]
-    for found in _candidates(node_count, pairs, sample):
+    keys, total = [np.zeros(0, dtype=np.int64)], 0.0
+    for found, estimate in _candidates(node_count, pairs, sample):
         keys.append(found)
+        total += estimate
     distinct = np.unique(np.concatenate(keys))
     edges = np.empty((len(distinct), 3), dtype=np.int32)
     errors = np.empty(len(distinct), dtype=np.float32)
@@ -77,18 +75,19 @@ def find_cycles(
         rows = slice(start, start + len(first))
         edges[rows] = np.stack([first, second, third], axis=1)
         errors[rows] = _cycle_angles(rotations[first], rotations[second], rotations[third])
-    smallest = np.full(edge_count, np.inf)
-    for side in range(3):
-        np.minimum.at(smallest, edges[:, side], errors)
-    return Cycles(edges, errors, np.where(np.isinf(smallest), np.nan, smallest))
+    return Cycles(edges, errors, _smallest(edge_count, edges, errors), total / max(edge_count, 1))
 
 
 def smallest_of(edge_count: int, cycles: Cycles, alive: Array) -> Array:
     """Smallest error (E,) in radians over cycles of three ``alive`` (E,) bool edges, NaN in none."""
     chosen = alive[cycles.edges].all(axis=1)
+    return _smallest(edge_count, cycles.edges[chosen], cycles.errors[chosen])
+
+
+def _smallest(edge_count: int, edges: Array, errors: Array) -> Array:
     smallest = np.full(edge_count, np.inf)
     for side in range(3):
-        np.minimum.at(smallest, cycles.edges[chosen, side], cycles.errors[chosen])
+        np.minimum.at(smallest, edges[:, side], errors)
     return np.where(np.isinf(smallest), np.nan, smallest)
 
 
@@ -108,8 +107,11 @@ def median_of(edge_count: int, cycles: Cycles, alive: Array) -> Array:
     return medians
 
 
-def _candidates(node_count: int, pairs: Array, sample: int) -> Iterator[Array]:
-    """Keys (T,) int64 of 3-cycles i < j < k in chunks: row of edge (i, j) times ``node_count``, plus k."""
+def _candidates(node_count: int, pairs: Array, sample: int) -> Iterator[tuple[Array, float]]:
+    """Keys (T,) int64 of 3-cycles i < j < k in chunks: row of edge (i, j) times ``node_count``, plus k.
+
+    Also about how many cycles the edges of the chunk are in, by the share that closed of those tried.
+    """
     if len(pairs) == 0:
         return
     heads, tails = pairs.T
@@ -137,7 +139,8 @@ def _candidates(node_count: int, pairs: Array, sample: int) -> Iterator[Array]:
         found = np.minimum(np.searchsorted(flat, wanted), len(flat) - 1)
         closed = (flat[found] == wanted) & (third != far[row])
         nodes = np.sort(np.stack([near[row], far[row], third], axis=1)[closed], axis=1)
-        yield np.searchsorted(flat, nodes[:, 0] * node_count + nodes[:, 1]) * node_count + nodes[:, 2]
+        keys = np.searchsorted(flat, nodes[:, 0] * node_count + nodes[:, 1]) * node_count + nodes[:, 2]
+        yield keys, float((available / counts) @ np.bincount(row[closed] - start, minlength=len(rows)))
 
 
 def _cycle_angles(r01: Array, r12: Array, r02: Array) -> Array:

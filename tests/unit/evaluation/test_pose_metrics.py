@@ -226,15 +226,39 @@ def test_unregistered_images_count_as_failures_and_strangers_are_not_scored() ->
     assert np.isnan(result.rotation_deg[0])
 
 
-def test_a_model_without_any_scored_image_gets_zeros_and_nulls() -> None:
+@pytest.mark.parametrize(("name", "area"), [("001.jpg", 0.0), (None, 0.0), ("x.jpg", None)])
+def test_a_model_without_any_scored_image_gets_zeros_and_nulls(name, area) -> None:
     rotations, centers = random_poses(4)
-    model = Poses(["x.jpg"], np.full((1, 3, 3), np.nan), np.full((1, 3), np.nan))
+    names = [name] if name else []
+    model = Poses(names, np.full((len(names), 3, 3), np.nan), np.full((len(names), 3), np.nan))
     metrics = evaluate_poses(model, named(rotations, centers), **DEFAULTS).metrics
-    assert metrics["relative_pose_auc_1deg"] == 0.0
-    assert metrics["pose_auc_20deg"] == 0.0
+    assert metrics["relative_pose_auc_1deg"] == area
+    assert metrics["pose_auc_20deg"] == area
     assert metrics["position_error_median"] is None
     assert metrics["alignment_scale"] is None
     json.dumps(metrics, allow_nan=False)
+
+
+@pytest.mark.parametrize(("present", "few"), [(0, True), (2, True), (3, False), (6, False)])
+def test_few_names_in_common_are_said(present, few) -> None:
+    rotations, centers = random_poses(6)
+    names = [f"{k:03d}.jpg" if k < present else f"other {k}.jpg" for k in range(6)]
+    said = evaluate_poses(
+        named(rotations, centers, names), named(rotations, centers), **DEFAULTS
+    ).few_present
+    assert bool(said) == few and (not few or f"only {present} of the 6 images" in said)
+
+
+def test_errors_of_images_have_the_names_of_the_model() -> None:
+    rotations, centers = random_poses(4)
+    model = named(rotations[:3], centers[:3], ["left/000.png", "001.jpg", "y.jpg"])
+    found = evaluate_poses(model, named(rotations, centers), **DEFAULTS).per_image()
+    names = {name: errors["reference_name"] for name, errors in found.items()}
+    assert names == {"left/000.png": "000.jpg", "001.jpg": "001.jpg"} | {
+        f"00{k}.jpg": f"00{k}.jpg" for k in (2, 3)
+    }
+    assert found["left/000.png"]["rotation_error_deg"] is not None
+    assert found["003.jpg"]["rotation_error_deg"] is None
 
 
 def test_known_noise_gives_known_errors() -> None:
@@ -321,6 +345,24 @@ def test_reprojection_errors_are_computed_whatever_a_tool_stored(tmp_path, capsy
     assert 0.5 < content["reprojection_error_px_median"] < 0.66
     metrics, evaluation = score_model(tmp_path, tmp_path)
     assert metrics == content and set(evaluation.metrics) < set(metrics)
+
+
+def test_points_behind_a_camera_are_counted_and_have_no_error(tmp_path, capsys) -> None:
+    made = make_problem(camera_count=6, point_count=200, noise_px=0.5)
+    model = to_reconstruction(true_model(made), made.keypoints, [f"{k}.jpg" for k in range(6)])
+    before = len(model.points3D)
+    seen = max(model.points3D.values(), key=lambda point: point.track.length())
+    images = [element.image_id for element in seen.track.elements]
+    behind = model.image(images[0]).cam_from_world().inverse() * np.array([0.0, 0.0, -1.0])
+    expected = sum(model.image(k).project_point(behind) is None for k in images)
+    assert 0 < expected <= len(images)
+    seen.xyz = behind
+    model.write_binary(str(tmp_path))
+    assert main([str(tmp_path), str(tmp_path)]) == 0
+    content = json.loads(capsys.readouterr().out)
+    assert content["observations_behind_camera"] == expected
+    assert content["points"] == before and content["reprojection_error_px_mean"] < 1e4
+    assert 0.5 < content["reprojection_error_px_median"] < 0.66
 
 
 def test_a_folder_without_a_model_and_a_damaged_one_end_with_one_sentence(tmp_path, capsys) -> None:

@@ -1,5 +1,6 @@
 """evaluate_model and render_report on small artifacts with exact truth."""
 
+import html
 import json
 import re
 
@@ -22,6 +23,35 @@ def test_evaluation_against_the_exported_truth(tmp_path, problem) -> None:
     assert metrics["per_image"][NAMES[0]]["position_error"] == pytest.approx(0.0, abs=1e-6)
     assert float(row["relative_pose_auc_5deg"]) == metrics["relative_pose_auc_5deg"]
     assert set(row) == set(metrics) - {"per_image", "reference"}
+
+
+def rename(folder, name_of):
+    """The model in a folder with other names of its images."""
+    model = pycolmap.Reconstruction(str(folder / "sparse" / "0"))
+    for image in model.images.values():
+        image.name = name_of(image.name)
+    other = folder.parent / "renamed"
+    other.mkdir()
+    model.write_binary(str(other))
+    return other
+
+
+def test_errors_of_images_are_shown_whatever_the_reference_calls_them(tmp_path, problem) -> None:
+    truth = rename(export(tmp_path, problem, lost=()), lambda name: name.replace(".jpg", ".png"))
+    metrics, _ = evaluate(tmp_path, problem, str(truth))
+    assert sorted(metrics["per_image"]) == NAMES
+    assert metrics["per_image"][NAMES[0]]["reference_name"] == NAMES[0].replace(".jpg", ".png")
+    page = report(tmp_path, problem, str(truth))
+    row = re.search(rf"<tr><td>{re.escape(html.escape(NAMES[0]))}</td>(.*?)</tr>", page, re.DOTALL)[1]
+    assert [float(cell) < 1e-3 for cell in re.findall(r"<td[^>]*>(.*?)</td>", row)[-2:]] == [True, True]
+
+
+def test_a_reference_of_other_names_has_no_areas_and_is_warned_of(tmp_path, problem, capsys) -> None:
+    truth = rename(export(tmp_path, problem, lost=()), lambda name: f"other {NAMES.index(name)}.jpg")
+    metrics, row = evaluate(tmp_path, problem, str(truth))
+    assert metrics["relative_pose_auc_1deg"] is None and row["relative_pose_auc_1deg"] == ""
+    assert f"warning: only 0 of the {COUNT} images of the reference" in capsys.readouterr().err
+    assert "relative pose AUC" not in report(tmp_path, problem, str(truth))
 
 
 def test_evaluation_without_a_reference_has_the_columns_that_need_none(tmp_path, problem) -> None:

@@ -8,7 +8,13 @@ import pycolmap
 import pytest
 from synthetic_scene import HEADER, side_by_side, true_model, write_scene
 
-from snakesfm.artifacts import CameraCenters, CameraRotations, Reconstruction
+from snakesfm.artifacts import (
+    CameraCenters,
+    CameraRotations,
+    Reconstruction,
+    TrackTable,
+    TriangulatedPoints,
+)
 from snakesfm.artifacts.gather import gather_image_columns, gather_inlier_matches
 from snakesfm.bundle import rounds
 from snakesfm.bundle.model import restrict_to
@@ -31,6 +37,7 @@ from snakesfm.stages import (
     triangulate_tracks,
 )
 from snakesfm.stages.job import StageJob
+from snakesfm.stages.triangulate_tracks import split_by_frame
 from snakesfm.synthetic.problems import make_problem
 
 SMALL, LARGE = 10, 14
@@ -103,18 +110,102 @@ def test_each_part_becomes_a_model_the_largest_first(made, scene):
     assert "part 2, round 3" in model.round_names.tolist() and "round 3" in model.round_names.tolist()
 
 
-def test_a_part_without_centres_is_no_model(scene, tmp_path, capsys):
-    centers = CameraCenters.read(scene["centers"])
-    columns = dict(vars(centers)) | {"centers": np.where(PART[:, None], np.nan, centers.centers)}
-    CameraCenters(**columns).write(tmp_path / "centers.h5", HEADER)
+def test_a_part_of_two_images_is_no_model(scene, tmp_path, capsys):
+    averaged = CameraCenters.read(scene["centers"])
+    kept = PART | np.isin(np.arange(COUNT), [2, 3])
+    centers = np.where(kept[:, None], averaged.centers, np.nan)
+    components = np.where(kept, averaged.components, -1)
+    replace(averaged, centers=centers, components=components).write(tmp_path / "centers.h5", HEADER)
     inputs = scene | {"centers": tmp_path / "centers.h5"}
     options = AdjustBundleOptions(refine_keypoints=False)
     run(adjust_bundle, options, inputs, tmp_path / "model.h5", intrinsics="fixed", images="")
     told = [line for line in capsys.readouterr().out.splitlines() if "left out" in line]
-    assert told == [f"part 1 is left out: 0 of its {LARGE} images have a pose, and a model needs 2"]
+    assert told == ["part 2 is left out: 2 of its images are in no other model, and a model needs 3"]
     model = Reconstruction.read(tmp_path / "model.h5")
-    np.testing.assert_array_equal(model.models, np.where(PART, -1, 0))
+    np.testing.assert_array_equal(model.models, np.where(PART, 0, -1))
     assert len(model.points) > 100
+
+
+@pytest.fixture
+def one_turned(scene, tmp_path):
+    """The inputs where averaging found one frame of rotations and two of positions, by images left out.
+
+    Tracks of the first part are joined to some of the second, as by images that see both.
+    """
+    inputs = scene | {
+        name: tmp_path / f"{name}.h5" for name in ("rotations", "tracks", "centers", "points")
+    }
+    averaged = CameraRotations.read(scene["rotations"])
+    replace(averaged, components=np.zeros(COUNT, int)).write(inputs["rotations"], HEADER)
+    tracks = TrackTable.read(scene["tracks"])
+    last = PART[tracks.image_ids[tracks.offsets[:-1]]].argmax()
+    run(
+        average_translations,
+        AverageTranslationsOptions(),
+        inputs | {"tracks": scene["tracks"]},
+        inputs["centers"],
+    )
+    ends = tracks.offsets[last : last + 101]
+    order = np.arange(len(tracks.image_ids))
+    starts = tracks.offsets[last - 100 : last]
+    pieces, offsets = [], [0]
+    for k in range(100):
+        pieces += [order[starts[k] : tracks.offsets[last - 99 + k]], order[ends[k] : ends[k + 1]]]
+        offsets.append(offsets[-1] + len(pieces[-2]) + len(pieces[-1]))
+    rows = np.concatenate([order[: starts[0]], *pieces, order[ends[-1] :]])
+    before, after = tracks.offsets[: last - 100], tracks.offsets[last + 101 :]
+    columns = ("image_ids", "keypoint_ids", "part_ids", "keypoints", "colors")
+    replace(
+        tracks,
+        offsets=np.r_[before, starts[0] + np.array(offsets), after],
+        **{name: getattr(tracks, name)[rows] for name in columns},
+    ).write(inputs["tracks"], HEADER)
+    return inputs
+
+
+def test_parts_of_one_frame_of_rotations_become_a_model_each(made, one_turned, tmp_path):
+    centers = CameraCenters.read(one_turned["centers"])
+    np.testing.assert_array_equal(centers.components, np.where(PART, 0, 1))
+    run(triangulate_tracks, TriangulateTracksOptions(), one_turned, one_turned["points"])
+    points = TriangulatedPoints.read(one_turned["points"])
+    seen = np.add.reduceat(PART[points.image_ids], points.offsets[:-1], dtype=int)
+    assert set(np.unique(seen / np.diff(points.offsets))) == {0.0, 1.0}
+    options = AdjustBundleOptions(refine_keypoints=False, complete_tracks=False)
+    run(adjust_bundle, options, one_turned, tmp_path / "model.h5", intrinsics="fixed", images="")
+    model = Reconstruction.read(tmp_path / "model.h5")
+    np.testing.assert_array_equal(model.models, np.where(PART, 0, 1))
+    for part in (PART, ~PART):
+        assert rotation_errors_deg(model.rotations[part], made.rotations[part]).max() < 0.5
+
+
+def test_images_that_the_largest_model_registers_leave_their_part(made, scene, tmp_path):
+    averaged = CameraCenters.read(scene["centers"])
+    odd = np.isin(np.arange(COUNT), SMALL + np.arange(5))
+    centers = np.where(odd[:, None], 0.3 * averaged.centers + 5.0, averaged.centers)
+    components = np.where(odd, 2, averaged.components)
+    inputs = scene | {"centers": tmp_path / "centers.h5", "points": tmp_path / "points.h5"}
+    replace(averaged, centers=centers, components=components).write(inputs["centers"], HEADER)
+    run(triangulate_tracks, TriangulateTracksOptions(), inputs, inputs["points"])
+    options = AdjustBundleOptions(refine_keypoints=False)
+    run(adjust_bundle, options, inputs, tmp_path / "model.h5", intrinsics="fixed", images="")
+    model = Reconstruction.read(tmp_path / "model.h5")
+    np.testing.assert_array_equal(model.models, np.where(PART, 0, 1))
+    assert rotation_errors_deg(model.rotations[PART], made.rotations[PART]).max() < 0.5
+
+
+def test_tracks_are_split_by_frame(one_turned):
+    tracks = TrackTable.read(one_turned["tracks"])
+    whole = split_by_frame(tracks, np.where(np.arange(COUNT) % 3 == 0, -1, 0))
+    for name, values in vars(tracks).items():
+        np.testing.assert_array_equal(getattr(whole, name), values)
+    split = split_by_frame(tracks, np.where(PART, 0, 1))
+    assert len(split.offsets) == len(tracks.offsets) + 100
+    assert sorted(zip(split.image_ids, split.keypoint_ids, strict=True)) == sorted(
+        zip(tracks.image_ids, tracks.keypoint_ids, strict=True)
+    )
+    for start, end in zip(split.offsets[:-1], split.offsets[1:], strict=True):
+        assert len(set(PART[split.image_ids[start:end]])) == 1
+        assert (np.diff(split.image_ids[start:end]) > 0).all()
 
 
 def test_a_part_that_comes_apart_leaves_no_intrinsics_behind(scene, tmp_path):
@@ -141,10 +232,10 @@ def test_a_part_that_comes_apart_leaves_no_intrinsics_behind(scene, tmp_path):
 
 def test_a_part_is_given_its_own_images_and_those_tied_to_it(made, scene, tmp_path, monkeypatch):
     left_out = np.array([3, SMALL + 4])
-    averaged = CameraRotations.read(scene["rotations"])
-    components, rotations = averaged.components.copy(), averaged.rotations.copy()
-    components[left_out], rotations[left_out] = -1, np.nan
-    replace(averaged, components=components, rotations=rotations).write(tmp_path / "rotations.h5", HEADER)
+    averaged = CameraCenters.read(scene["centers"])
+    components, centers = averaged.components.copy(), averaged.centers.copy()
+    components[left_out], centers[left_out] = -1, np.nan
+    replace(averaged, components=components, centers=centers).write(tmp_path / "centers.h5", HEADER)
     given = []
 
     def adjust_rounds(reconstruction, *arguments):
@@ -153,7 +244,7 @@ def test_a_part_is_given_its_own_images_and_those_tied_to_it(made, scene, tmp_pa
         return rounds.adjust_rounds(reconstruction, *arguments)
 
     monkeypatch.setattr(adjust_bundle, "adjust_rounds", adjust_rounds)
-    inputs = scene | {"rotations": tmp_path / "rotations.h5"}
+    inputs = scene | {"centers": tmp_path / "centers.h5"}
     options = AdjustBundleOptions(refine_keypoints=False)
     run(adjust_bundle, options, inputs, tmp_path / "model.h5", intrinsics="fixed", images="")
     for (images, registered), part in zip(given, (PART, ~PART), strict=True):

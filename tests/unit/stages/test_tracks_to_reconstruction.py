@@ -49,7 +49,7 @@ def inputs(made, tmp_path):
     )
     centers = made.centers + np.random.default_rng(0).normal(0, 0.01, (COUNT, 3))
     centers[5] = np.nan
-    CameraCenters(centers, np.zeros(edges), np.zeros(0)).write(inputs["centers"], HEADER)
+    CameraCenters(centers, components, np.zeros(edges), np.zeros(0)).write(inputs["centers"], HEADER)
     return inputs
 
 
@@ -168,9 +168,8 @@ def camera_row(camera):
 
 
 def test_refused_edges_make_no_tracks(inputs):
-    graph = ViewGraph.read(inputs["graph"])
-    columns = dict(vars(graph)) | {"labels": np.ones(len(graph.pairs), np.int8)}
-    ViewGraph(**columns).write(inputs["graph"], HEADER)
+    averaged = CameraRotations.read(inputs["rotations"])
+    replace(averaged, labels=np.ones(len(averaged.labels), np.int8)).write(inputs["rotations"], HEADER)
     kept = (
         "'scene': no point is seen in {} images along the 0 kept image pairs: add images with more overlap"
     )
@@ -181,11 +180,13 @@ def test_refused_edges_make_no_tracks(inputs):
         run(build_tracks, options, inputs, inputs["tracks"])
 
 
-def test_edges_that_the_averaged_rotations_contradict_make_no_tracks(inputs):
-    averaged = CameraRotations.read(inputs["rotations"])
-    replace(averaged, labels=np.ones(len(averaged.labels), np.int8)).write(inputs["rotations"], HEADER)
-    with pytest.raises(SceneError, match="along the 0 kept image pairs"):
-        run(build_tracks, BuildTracksOptions(), inputs, inputs["tracks"])
+def test_edges_that_rotation_averaging_took_back_make_tracks(inputs):
+    run(build_tracks, BuildTracksOptions(), inputs, inputs["tracks"])
+    expected = inputs["tracks"].read_bytes()
+    graph = ViewGraph.read(inputs["graph"])
+    replace(graph, labels=np.arange(len(graph.pairs)) % 2).write(inputs["graph"], HEADER)
+    run(build_tracks, BuildTracksOptions(), inputs, inputs["tracks"])
+    assert inputs["tracks"].read_bytes() == expected
 
 
 @pytest.mark.parametrize(("settings", "merged"), [({}, False), ({"detector_shorter_side_px": 240}, True)])

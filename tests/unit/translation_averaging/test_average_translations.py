@@ -194,6 +194,21 @@ def test_restarts_have_the_loss_of_global_positioning(monkeypatch):
     assert told == [(many, 0.2, 0), (many, 0.2, 1)]
 
 
+def test_no_start_is_tried_after_one_with_which_most_rays_agree(monkeypatch):
+    truth = make_problem(12, 600, "area", noise_px=0.3, rotation_noise_deg=0.05, seed=3)
+    problem, told = positioning(truth), []
+
+    def position(rays, loss_scale, seed):
+        told.append(seed)
+        return truth.centers if len(told) > 1 else np.zeros((rays.image_count, 3))
+
+    monkeypatch.setattr("snakesfm.translation_averaging.positioning.position_globally", position)
+    misled = replace(settings(refine=False, restarts=4), averager=Misled())
+    centers = average_translations(problem, misled).centers
+    assert told == [0, 1]
+    assert errors(centers, truth.centers).max() < 0.01
+
+
 @pytest.mark.parametrize("method", ["scale_chain", "global_positioning"])
 def test_tracks_are_chosen_once_and_once_more_for_all_restarts(method, monkeypatch):
     problem = positioning(make_problem(12, 600, "area", noise_px=0.3, seed=3))

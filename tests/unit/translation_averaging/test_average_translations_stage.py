@@ -5,7 +5,7 @@ import pytest
 from plain_artifacts import HEADER, write_plain_tracks
 from synthetic_scene import write_scene
 
-from snakesfm.artifacts import CameraCenters, CameraRotations, ViewGraph
+from snakesfm.artifacts import CameraCenters, CameraRotations, TrackTable, ViewGraph
 from snakesfm.config.average_translations import AverageTranslationsOptions
 from snakesfm.errors import SceneError
 from snakesfm.stages.average_translations import run
@@ -13,15 +13,19 @@ from snakesfm.stages.job import StageJob
 from snakesfm.synthetic.problems import make_problem
 
 
-def write_inputs(folder, truth, rotations, **edges):
-    """The scene up to its tracks, with these averaged rotations and columns of the view graph."""
+def write_inputs(folder, truth, rotations, kinds=None, labels=None):
+    """The scene up to its tracks, with these averaged rotations, kinds of edges and labels of averaging."""
     inputs = write_scene(truth, folder)
-    replace(ViewGraph.read(inputs["graph"]), **edges).write(inputs["graph"], HEADER)
     count = len(truth.pairs)
+    none = np.zeros(count, int)
+    graph = ViewGraph.read(inputs["graph"])
+    # what the filter refused counts as averaging has it
+    graph = replace(graph, labels=np.arange(count) % 2, kinds=none if kinds is None else kinds)
+    graph.write(inputs["graph"], HEADER)
     CameraRotations(
         rotations=rotations,
         residuals_deg=np.zeros(count),
-        labels=np.zeros(count, int),
+        labels=none if labels is None else labels,
         components=np.where(np.isfinite(rotations[:, 0, 0]), 0, -1),
     ).write(inputs["rotations"], HEADER)
     write_plain_tracks(inputs["tracks"], truth)
@@ -65,6 +69,32 @@ def test_stage_writes_centers_and_residuals(tmp_path, method):
     assert (result.edge_residuals_deg[truth.edge_outliers & ~off] < 5.0).mean() < 0.2
     assert (result.edge_residuals_deg[~off & ~truth.edge_outliers] < 5.0).mean() > 0.9
     assert np.median(result.ray_residuals_deg) < 0.15
+
+
+def test_a_component_with_which_few_rays_agree_is_warned_of_by_itself(tmp_path, capsys):
+    truth = make_problem(30, 2000, "area", 0.3, 0.05, seed=2)
+    inputs = write_inputs(tmp_path, truth, truth.rotations)
+    tracks = TrackTable.read(inputs["tracks"])
+    wild = np.isin(tracks.image_ids, [3, 5, 8, 10])
+    keypoints = np.where(
+        wild[:, None], np.random.default_rng(0).uniform(0, 480, (len(wild), 2)), tracks.keypoints
+    )
+    replace(tracks, keypoints=keypoints.astype(np.float32)).write(inputs["tracks"], HEADER)
+    averaged = CameraRotations.read(inputs["rotations"])
+    components = (np.arange(30) < 12).astype(int)
+    replace(averaged, components=components).write(inputs["rotations"], HEADER)
+    run(stage_job(tmp_path, inputs, restarts=0))
+    found = CameraCenters.read(tmp_path / "centers.h5").components
+    placed = found >= 0
+    assert placed[12:].all() and not placed[[3, 5, 8, 10]].any() and placed.sum() >= 24
+    np.testing.assert_array_equal(found[placed], components[placed])
+    said, count = capsys.readouterr(), placed.sum() - 18
+    (warning,) = [line for line in said.err.splitlines() if "warning" in line]
+    assert f"agree with the positions of {count} cameras" in warning
+    assert (
+        f"{placed.sum()} of 30 images with a rotation are positioned in frames of 18, {count} im"
+        in said.out
+    )
 
 
 def test_two_images(tmp_path):

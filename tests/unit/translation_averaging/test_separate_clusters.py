@@ -30,7 +30,7 @@ def join_two_clusters(seed: int, ties: int, wrong: int) -> float | None:
     problem = PositioningProblem(16, pairs, directions, np.ones(len(pairs)), none, none, np.zeros((0, 3)))
     first, second = centers.copy(), (centers - [3, 1, 2]) * 0.37
     first[8:], second[:8] = np.nan, np.nan
-    joined = join_by_edges(problem, [first, second], 0.1)[8:]
+    joined = join_by_edges(problem, [first, second], 0.1)[0][8:]
     return float(np.linalg.norm(joined - centers[8:], axis=1).mean()) if np.isfinite(joined).all() else None
 
 
@@ -67,7 +67,7 @@ def two_clusters(edges_between):
 def test_clusters_without_common_landmarks_are_joined_by_edges(averager):
     truth, problem, second = two_clusters(slice(0, 40, 10))
     if averager == "chain":
-        centers = chain_centers(problem, np.radians(0.45), 0.1)
+        centers = chain_centers(problem, np.radians(0.45), 0.1)[0]
     else:
         centers = average_translations(problem, SETTINGS).centers
     assert np.isfinite(centers).all()
@@ -82,7 +82,7 @@ def test_a_wrong_edge_between_clusters_is_outvoted():
     across = np.flatnonzero(second[problem.pairs[:, 0]] != second[problem.pairs[:, 1]])
     directions = problem.directions.copy()
     directions[across[0]] = np.roll(directions[across[0]], 1)
-    centers = chain_centers(replace(problem, directions=directions), np.radians(0.45), 0.1)
+    centers = chain_centers(replace(problem, directions=directions), np.radians(0.45), 0.1)[0]
     extent = np.linalg.norm(np.ptp(truth.centers, axis=0))
     assert np.isfinite(centers).all() and errors(centers, truth.centers).max() < 0.02 * extent
 
@@ -90,8 +90,9 @@ def test_a_wrong_edge_between_clusters_is_outvoted():
 @pytest.mark.parametrize("edges_between", [slice(0, 0), slice(0, 1)])
 def test_a_cluster_stays_out_where_edges_do_not_tell_its_scale(edges_between):
     truth, problem, second = two_clusters(edges_between)
-    centers = chain_centers(problem, np.radians(0.45), 0.1)
+    centers, apart = chain_centers(problem, np.radians(0.45), 0.1)
     assert np.array_equal(np.isfinite(centers[:, 0]), ~second)
+    assert np.array_equal(apart, second)
     assert errors(centers, truth.centers).max() < 0.005 * np.linalg.norm(np.ptp(truth.centers, axis=0))
 
 
@@ -105,6 +106,6 @@ def test_a_cluster_stays_out_where_edges_contradict_each_other_or_its_direction(
         others /= np.linalg.norm(others, axis=1, keepdims=True)
     elif directions == "negated":
         others[across] *= -1.0
-    centers = chain_centers(replace(problem, directions=others), np.radians(0.45), 0.1)
+    centers, apart = chain_centers(replace(problem, directions=others), np.radians(0.45), 0.1)
     assert np.isfinite(centers[~second]).all()
-    assert np.isfinite(centers[second, 0]).sum() == count
+    assert np.isfinite(centers[second, 0]).sum() == count == 10 - apart.sum()

@@ -97,6 +97,15 @@ def test_sampled_cycles_are_real_and_bounded():
     np.testing.assert_array_equal(smallest_of(len(pairs), sampled, alive), sampled.smallest)
 
 
+@pytest.mark.parametrize(("share", "tried"), [(1.0, 8), (0.3, 8), (0.3, 64)])
+def test_cycles_per_edge_do_not_depend_on_how_many_are_tried(share, tried):
+    pairs, rotations, _ = noisy_graph(120, share, 2)
+    full = find_cycles(120, pairs, rotations, tried_per_edge=120)
+    assert full.per_edge == 3 * len(full.edges) / len(pairs) > 6.0
+    sampled = find_cycles(120, pairs, rotations, tried_per_edge=tried)
+    assert sampled.per_edge == pytest.approx(full.per_edge, rel=0.05)
+
+
 @pytest.mark.parametrize("seed", range(4))
 def test_bridges_are_what_disconnects(seed):
     rng = np.random.default_rng(seed)
