@@ -26,7 +26,7 @@ from snakesfm.front_ends import (
 )
 from snakesfm.geometry.detector_sides import LONGER_SIDE, SHORTER_SIDE
 from snakesfm.hloc_files import FEATURES, MATCHES, PAIRS
-from snakesfm.ingest.discover import MASK_DIGESTS_NAME, count_images, fingerprint_images
+from snakesfm.ingest.discover import DIGESTS_NAME, MASK_DIGESTS_NAME, count_images, fingerprint_images
 from snakesfm.model_files import MODEL_FILES
 from snakesfm.pair_lists import estimate_pair_count, find_pair_list, pair_list_state
 from snakesfm.pipeline import STAGES, stages_between
@@ -311,7 +311,7 @@ class ScenePlan:
 
     @functools.cached_property
     def _fingerprint(self) -> str:
-        return fingerprint_images(self.images, self.folder / "index_images" / "digests.json")
+        return fingerprint_images(self.images, self.folder / "index_images" / DIGESTS_NAME)
 
     @functools.cached_property
     def _mask_fingerprint(self) -> str:
