@@ -251,8 +251,9 @@ class ScenePlan:
         wanted = 1 if self.configuration.device == "cuda" else self.configuration.batch_size
         batch = 1 if wanted == "auto" else wanted
         pairs = self.proposed_pair_count if stage == "select_pairs" else self.pair_count
-        side = self.configuration.extract_features.max_shorter_side_px
-        load = job_load(stage, self.image_count, self.blocks, pairs, networks, batch, side)
+        of = self.configuration.extract_features
+        sizes = (of.max_shorter_side_px, of.max_keypoints)
+        load = job_load(stage, self.image_count, self.blocks, pairs, networks, batch, *sizes)
         return replace(load, undistorting=threads) if stage == "export_model" and self.undistorts else load
 
     def final_files(self) -> list[str]:

@@ -184,7 +184,14 @@ def memory_mb(stage):
 
 def runtime_min(stage):
     """A resource function: the minutes that a job asks a cluster for."""
-    return asking(resources.runtime_min, stage)
+
+    def need(stage, load, attempt):
+        # Snakemake knows them only when it has read the Snakefile
+        groups = workflow.group_settings.overwrite_groups
+        start = resources.start_min(stage, groups)
+        return resources.runtime_min(stage, load, attempt, start)
+
+    return asking(need, stage)
 
 
 def asking(need, stage):
