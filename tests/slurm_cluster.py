@@ -54,7 +54,11 @@ SlurmdTimeout=10
 KillWait=2
 MinJobAge=3600
 {nodes}
+PreemptType=preempt/partition_prio
+PreemptMode=REQUEUE
 PartitionName=main Nodes=n[1-{count}] Default=YES MaxTime=INFINITE State=UP
+PartitionName=short Nodes=n[1-{count}] MaxTime=1 State=UP
+PartitionName=urgent Nodes=n[1-{count}] PriorityTier=2 State=UP
 """
 
 
@@ -174,7 +178,8 @@ class Cluster:
 
     def wait_for_nodes(self, state: str) -> None:
         """Wait until all nodes are in a state."""
-        wait_for(lambda: self.call("sinfo", "-hN", "-o", "%T").split() == [state] * len(self.names), state)
+        expected = [state] * len(self.names)
+        wait_for(lambda: self.call("sinfo", "-hN", "-p", "main", "-o", "%T").split() == expected, state)
 
     def _spawn(self, name: str, command: list[str]) -> None:
         with (self.folder / f"{name}.out").open("ab") as out:

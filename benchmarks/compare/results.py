@@ -7,6 +7,7 @@ from typing import Any
 
 from benchmarks.compare.measure import Cost
 from benchmarks.compare.methods import GROUPS, job_counts
+from snakesfm.artifacts import write_json
 
 OURS = "snakesfm"
 INCREMENTAL = "colmap_incremental"
@@ -56,10 +57,7 @@ class Result:
 
     def write(self, folder: Path) -> None:
         """Store it."""
-        folder.mkdir(parents=True, exist_ok=True)
-        temporary = self.path(folder).with_suffix(".tmp")
-        temporary.write_text(json.dumps(asdict(self), indent=1, sort_keys=True) + "\n", "utf-8")
-        temporary.replace(self.path(folder))
+        write_json(self.path(folder), asdict(self))
 
     def stored(self, folder: Path) -> "Result | None":
         """The stored result of the same run with the same inputs."""

@@ -5,12 +5,13 @@ or pair is compared by its own digest again, so a wrong or damaged file costs ti
 finds one puts another in its place.
 """
 
-import contextlib
 import hashlib
 import os
 import shutil
 from collections.abc import Iterable
 from pathlib import Path
+
+from snakesfm.atomic import atomic_path
 
 VARIABLE = "SNAKESFM_CACHE"
 
@@ -43,17 +44,11 @@ def share(path: Path, cached: Path, replace: bool = False) -> None:
         # its name is a digest of what it holds
         if not replace and cached.exists():
             return
-        cached.parent.mkdir(parents=True, exist_ok=True)
-        temporary = cached.with_name(f".{cached.name}.{os.uname().nodename}.{os.getpid()}")
-        try:
-            with contextlib.suppress(FileNotFoundError):
-                temporary.unlink()
+        with atomic_path(cached) as temporary:
+            temporary.unlink()
             try:
-                os.link(path, temporary)
+                temporary.hardlink_to(path)
             except OSError:
                 shutil.copyfile(path, temporary)
-            temporary.replace(cached)
-        finally:
-            temporary.unlink(missing_ok=True)
     except OSError as error:
         print(f"warning: {cached} could not be shared ({error}); correct {VARIABLE} or unset it.")

@@ -6,9 +6,15 @@ SnakesfmError            anything that ends a job with one clear sentence
 │   └── UnreadableImageError   its file cannot be read, whatever is in it
 ├── SceneError           a scene as a whole cannot be reconstructed
 └── ArtifactError        a file that a stage reads is missing, damaged or of another version
+    └── UnreadableArtifactError   the system cannot read it, whatever is in it
 
 Every message is one sentence that names the file or key and says what to do.
 """
+
+import errno
+
+LACK_OF_SPACE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+LACK_OF_RIGHTS = (errno.EACCES, errno.EPERM, errno.EROFS)
 
 
 class SnakesfmError(Exception):
@@ -33,3 +39,14 @@ class SceneError(SnakesfmError):
 
 class ArtifactError(SnakesfmError):
     """An artifact that cannot be read."""
+
+
+class UnreadableArtifactError(ArtifactError):
+    """An artifact that the system cannot read, now at least."""
+
+
+def remedy_of(number: int) -> str:
+    """What to do about an error of the system, by its number: others than these pass by themselves."""
+    if number in LACK_OF_SPACE + LACK_OF_RIGHTS:
+        return "free the disk or correct the permission, then run again"
+    return "start the same command again"

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from snakesfm.atomic import atomic_path
 from snakesfm.job_logs import clock, describe_cost
 
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
@@ -145,11 +146,10 @@ def _keep_former(job: Any, module: Any) -> None:
     if not getattr(module, "REUSES_FORMER", False):
         return
     former = former_path(job.output)
-    temporary = former.with_name(f"{former.name}.{os.getpid()}")
     try:
-        former.parent.mkdir(exist_ok=True)
-        os.link(job.output, temporary)
-        temporary.replace(former)
+        with atomic_path(former) as temporary:
+            temporary.unlink()
+            temporary.hardlink_to(job.output)
     except OSError as error:
         print(f"warning: {former} could not be kept ({error}); a re-run will compute everything again.")
 
@@ -195,16 +195,14 @@ def _damage_behind(call: Call, error: Exception) -> Exception | None:
 
 def _fail(call: Call, error: Exception, terminal: Any) -> None:
     """Say what went wrong, in the log and on the terminal, and end with exit status 1."""
-    from snakesfm.errors import SnakesfmError
+    from snakesfm.errors import SnakesfmError, remedy_of
 
     if isinstance(error, SnakesfmError):
         sentence = str(error)
     elif isinstance(error, OSError) and error.errno:
         # h5py's errors have a number and a message of many lines
-        where = f" '{error.filename or Path(call.files['outputs'][0]).parent}'"
-        sentence = (
-            f"{os.strerror(error.errno)}{where}: free the disk or correct the permission, then run again."
-        )
+        where = error.filename or Path(call.files["outputs"][0]).parent
+        sentence = f"{os.strerror(error.errno)} '{where}': {remedy_of(error.errno)}."
         _print_trace()
     elif isinstance(error, MemoryError):
         sentence = (

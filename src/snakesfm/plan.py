@@ -49,9 +49,16 @@ class Plan:
     ----------
     config : the configuration as Snakemake has it.
     weights_only : the run just fetches weights, so no scene is planned and no images need be there.
+    image_counts : in a job, by scene, how many images its run was planned with; those that are there now do
+        not count, and nothing is checked again.
     """
 
-    def __init__(self, config: Mapping[str, Any], weights_only: bool = False) -> None:
+    def __init__(
+        self,
+        config: Mapping[str, Any],
+        weights_only: bool = False,
+        image_counts: Mapping[str, int] | None = None,
+    ) -> None:
         self.configuration = configuration = load_configuration(config)
         _check_homes(configuration)
         self.output = Path(configuration.output).expanduser()
@@ -61,6 +68,8 @@ class Plan:
             name: ScenePlan(name, inputs, configuration, self.output)
             for name, inputs in list_scenes(configuration).items()
         }
+        for name, count in (image_counts or {}).items():
+            planned[name].image_count = count
         # the networks whose weights any scene's stages may read
         self.models = sorted(
             {
@@ -73,8 +82,9 @@ class Plan:
         self.scenes = {} if weights_only else planned
         if not weights_only:
             _check_writable(self.output)
-        for scene in self.scenes.values():
-            check_scene(scene)
+        if not image_counts:
+            for scene in self.scenes.values():
+                check_scene(scene)
 
     def scenes_by_blocks(self) -> dict[int, list[str]]:
         """The names of the scenes that have each number of blocks."""

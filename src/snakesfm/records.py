@@ -6,6 +6,7 @@ import re
 from base64 import urlsafe_b64encode
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 from snakesfm.errors import ConfigError
 
@@ -61,11 +62,8 @@ def _is_recorded(output: str, records: Path) -> bool:
         changed = Path(output).stat().st_mtime
     except OSError:
         return True
-    try:
-        record = json.loads((records / _record_name(output)).read_text("utf-8"))
-        return abs(float(record["endtime"]) - changed) < SAME_TIME_S
-    except (OSError, ValueError, KeyError, TypeError):
-        return False
+    ended = _read_record(output, records).get("endtime")
+    return isinstance(ended, int | float) and abs(ended - changed) < SAME_TIME_S
 
 
 def was_made_with(output: str, params: str, records: Path = RECORDS) -> bool:
@@ -77,11 +75,17 @@ def was_made_with(output: str, params: str, records: Path = RECORDS) -> bool:
     params : the one param that Snakemake compares.
     records : Snakemake's folder of records.
     """
+    noted = _read_record(output, records).get("params")
+    return not isinstance(noted, list) or repr(params) in noted
+
+
+def _read_record(output: str, records: Path) -> dict[str, Any]:
+    """What Snakemake noted of an output; empty where that is nothing, or cannot be read."""
     try:
-        noted = json.loads((records / _record_name(output)).read_text("utf-8"))["params"]
-    except (OSError, ValueError, KeyError, TypeError):
-        return True
-    return repr(params) in noted
+        record = json.loads((records / _record_name(output)).read_text("utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return record if isinstance(record, dict) else {}
 
 
 def check_folder(snakefile: str) -> None:

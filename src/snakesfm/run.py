@@ -14,7 +14,8 @@ from typing import Any
 
 from snakesfm import slurm
 from snakesfm.errors import ConfigError
-from snakesfm.job_logs import find_cost
+from snakesfm.evaluation.summary import describe_accuracy
+from snakesfm.job_logs import KILLED, describe_failures
 from snakesfm.model_files import SUMMARY, lacks_pictures
 from snakesfm.plan import Plan
 from snakesfm.records import MAKES_PART, forget, unrecorded_files, was_made_with
@@ -23,12 +24,14 @@ from snakesfm.scene_plan import ScenePlan
 LOCK_NAME = ".snakesfm.lock"
 CONFIGURATION_NAME = ".snakesfm.config.json"
 MOST_SENTENCES = 10
-KILLED = "was killed from outside (out of memory, time limit, cancelled, or its node failed)"
-# what SQLite says before it ends a process in which COLMAP writes a database
-FULL_SIGN = "database or disk is full"
-LACKS_SPACE = "ended as the disk is full: free the disk, then run again"
+IMAGE_COUNTS = "image_counts"
+"""Key of the configuration that jobs are given: by scene, how many images the run was planned with."""
 FEWER_JOBS = "; if memory ran out, with fewer jobs at once: --cores N or --resources mem_mb=MB"
-RELATIVE_AUC = re.compile(r"relative_pose_auc_(.+)deg")
+MORE_FOR_JOBS = (
+    "; if memory or time ran out, request more in set-resources of the profile: "
+    "RULE: {mem_mb: MB, runtime: MINUTES}"
+)
+SEE_ABOVE = "; if jobs failed, Snakemake's messages above say why"
 
 
 class Run:
@@ -106,10 +109,13 @@ class Run:
         try:
             fcntl.flock(lock, how | fcntl.LOCK_NB)
         except BlockingIOError:
-            lock.seek(0)
+            holder, run = _read_note(lock)
+            # without the file, nobody would cancel these
+            cancel = f"run 'scancel --name={run}' and " if run else ""
             raise ConfigError(
-                f"Another run ({lock.read().strip() or 'unknown'}) is writing to "
-                f"'{self.plan.output}': wait for it to end, or choose another output=DIR."
+                f"Another run ({holder or 'unknown'}) is writing to '{self.plan.output}': wait for it to "
+                "end, or choose another output=DIR; if its machine is down for good, "
+                f"{cancel}delete {lock.name}."
             ) from None
 
     def start(self, slurm_run: str = "") -> None:
@@ -177,8 +183,10 @@ class Run:
         from snakesfm.artifacts import write_json
 
         path = (self.plan.output / CONFIGURATION_NAME).absolute()
+        # blocks and pairs depend on them, so images that are added meanwhile must not count
+        counts = {name: scene.image_count for name, scene in self.plan.scenes.items()}
         try:
-            write_json(path, self.plan.configuration.model_dump())
+            write_json(path, {IMAGE_COUNTS: counts, **self.plan.configuration.model_dump()})
         except OSError as error:
             raise self._lack_of_space(error) from None
         workflow.config_settings.configfiles = [path]
@@ -198,12 +206,15 @@ class Run:
 
     def _end_former_jobs(self) -> None:
         """Cancel what an interrupted run has left in SLURM's queue."""
-        self.lock.seek(0)
-        former = re.search(r"SLURM run (\S+)", self.lock.read())
+        former = _read_note(self.lock)[1]
         if former:
-            count = slurm.end_jobs(former[1], str(self.plan.output), self.lock.name)
-            if count:
-                print(f"snakesfm: {count} SLURM jobs of an interrupted run were cancelled.", flush=True)
+            self._end_jobs(former)
+
+    def _end_jobs(self, run: str) -> None:
+        """Cancel the SLURM jobs of an interrupted run and wait until they are gone."""
+        count = slurm.end_jobs(run, str(self.plan.output), self.lock.name)
+        if count:
+            print(f"snakesfm: {count} SLURM jobs of an interrupted run were cancelled.", flush=True)
 
     def _bring_times_back(self) -> None:
         """Give files from the future, which a wrong clock made, the present time, in their order.
@@ -259,11 +270,9 @@ class Run:
             return
         self.planned = planned
         _cancel_timers()
-        with contextlib.suppress(OSError, subprocess.SubprocessError):
-            if not self.slurm_run or not slurm.list_jobs(self.slurm_run):
-                self._note("")
+        self._leave_slurm()
         for scene in self.plan.scenes.values():
-            sentences = self.failures(scene)
+            sentences = describe_failures(scene.folder / "logs", self.begun, self.interrupted)
             for sentence in sentences[:MOST_SENTENCES]:
                 print(f"snakesfm: scene '{scene.name}' failed: {sentence}", flush=True)
             if len(sentences) > MOST_SENTENCES:
@@ -271,7 +280,9 @@ class Run:
                 print(f"snakesfm: scene '{scene.name}' failed: {more} more jobs.", flush=True)
             killed = any(KILLED in sentence for sentence in sentences)
             if killed or (not sentences and scene.name in unfinished):
-                advice = FEWER_JOBS if killed and on_one_machine else ""
+                advice = "" if self.interrupted else SEE_ABOVE
+                if killed:
+                    advice = FEWER_JOBS if on_one_machine else MORE_FOR_JOBS
                 print(
                     f"snakesfm: scene '{scene.name}' is not finished: start the same command "
                     f"again{advice}.",
@@ -280,24 +291,20 @@ class Run:
             elif not sentences:
                 print(self.describe(scene), flush=True)
 
-    def failures(self, scene: ScenePlan) -> list[str]:
-        """The sentences of the scene's jobs that failed in this run, with their logs.
+    def _leave_slurm(self) -> None:
+        """Have the next run find nothing to cancel; after an interrupt no job is left.
 
-        Jobs that were killed are left out where the user interrupted the run, which kills them.
+        Snakemake then cancels those that it knows of, and goes on to submit those that it had begun with.
         """
-        sentences = []
-        for log in sorted((scene.folder / "logs").rglob("*.log")):
-            if log.stat().st_mtime < self.begun:
-                continue
-            lines = log.read_text("utf-8", errors="replace").splitlines()
-            # one that is killed before its first line leaves an empty log
-            if lines and lines[-1].startswith("error: "):
-                sentences.append(f"{lines[-1].removeprefix('error: ')} (log: {log})")
-            elif not self.interrupted and (not lines or not find_cost(lines[-1])):
-                full = any(FULL_SIGN in line for line in lines)
-                reason = LACKS_SPACE if full else KILLED
-                sentences.append(f"{log.parent.name} {log.stem} {reason} (log: {log})")
-        return sentences
+        with contextlib.suppress(OSError, subprocess.SubprocessError):
+            try:
+                if self.slurm_run and self.interrupted:
+                    self._end_jobs(self.slurm_run)
+            except ConfigError as error:
+                print(f"snakesfm: {error}", flush=True)
+            else:
+                if not self.slurm_run or not slurm.list_jobs(self.slurm_run):
+                    self._note("")
 
     def _summary(self, scene: ScenePlan) -> dict[str, Any]:
         """What export_model says of the scene's model; empty where there is none of the present images."""
@@ -347,7 +354,7 @@ class Run:
             return f"snakesfm: scene '{scene.name}': {', '.join(filter(None, (in_database, model)))}."
         others = summary.get("images_in_other_models", [])
         more = f" and {sum(others)} in {len(others)} other models" if others else ""
-        accuracy = _describe_accuracy(self._read_result(scene, "evaluate_model", "metrics.json"))
+        accuracy = describe_accuracy(self._read_result(scene, "evaluate_model", "metrics.json"))
         return (
             f"snakesfm: scene '{scene.name}': {summary['registered_images']} of {summary['images']} images "
             f"registered{more}, {summary['points']} points, mean reprojection error "
@@ -355,6 +362,14 @@ class Run:
             f"{time.time() - self.started:.0f} s; model in {scene.folder / 'export_model' / 'sparse' / '0'}"
             f"{', ' + in_database if in_database else ''}"
         )
+
+
+def _read_note(lock: Any) -> tuple[str, str]:
+    """What a lock file says: who holds it or did so last, and the name of that run's SLURM jobs."""
+    lock.seek(0)
+    note = lock.read().strip()
+    run = re.search(r"SLURM run (\S+)", note)
+    return note, run[1] if run else ""
 
 
 def _set_aside(scene: ScenePlan, unknown: list[Path]) -> None:
@@ -369,21 +384,6 @@ def _set_aside(scene: ScenePlan, unknown: list[Path]) -> None:
             f".snakemake were renamed to *{ASIDE} and will be recreated: {found[0]}.",
             flush=True,
         )
-
-
-def _describe_accuracy(metrics: dict[str, Any]) -> str:
-    """A clause on how near a model is to its reference; empty where there is none."""
-    if "reference_images" not in metrics:
-        return ""
-    images, present = metrics["reference_images"], metrics["reference_images_present"]
-    if not present:
-        return ", no image name occurs in the reference, so nothing is evaluated"
-    found = [area for area in map(RELATIVE_AUC.fullmatch, metrics) if area]
-    found.sort(key=lambda area: float(area[1]))
-    areas = "/".join(f"{metrics[area[0]]:.1f}" for area in found)
-    thresholds = "/".join(area[1] for area in found)
-    share = f" over the reference's {images} images, {present} of them here" if present < images else ""
-    return f", relative-pose AUC {areas} at {thresholds} deg{share}"
 
 
 def _cancel_timers() -> None:

@@ -26,7 +26,7 @@ from snakesfm.front_ends import (
 )
 from snakesfm.geometry.detector_sides import LONGER_SIDE, SHORTER_SIDE
 from snakesfm.hloc_files import FEATURES, MATCHES, PAIRS
-from snakesfm.ingest.discover import MASK_DIGESTS_NAME, count_images, fingerprint_images
+from snakesfm.ingest.discover import DIGESTS_NAME, MASK_DIGESTS_NAME, count_images, fingerprint_images
 from snakesfm.model_files import MODEL_FILES
 from snakesfm.pair_lists import estimate_pair_count, find_pair_list, pair_list_state
 from snakesfm.pipeline import STAGES, stages_between
@@ -251,8 +251,9 @@ class ScenePlan:
         wanted = 1 if self.configuration.device == "cuda" else self.configuration.batch_size
         batch = 1 if wanted == "auto" else wanted
         pairs = self.proposed_pair_count if stage == "select_pairs" else self.pair_count
-        side = self.configuration.extract_features.max_shorter_side_px
-        load = job_load(stage, self.image_count, self.blocks, pairs, networks, batch, side)
+        of = self.configuration.extract_features
+        sizes = (of.max_shorter_side_px, of.max_keypoints)
+        load = job_load(stage, self.image_count, self.blocks, pairs, networks, batch, *sizes)
         return replace(load, undistorting=threads) if stage == "export_model" and self.undistorts else load
 
     def final_files(self) -> list[str]:
@@ -311,7 +312,7 @@ class ScenePlan:
 
     @functools.cached_property
     def _fingerprint(self) -> str:
-        return fingerprint_images(self.images, self.folder / "index_images" / "digests.json")
+        return fingerprint_images(self.images, self.folder / "index_images" / DIGESTS_NAME)
 
     @functools.cached_property
     def _mask_fingerprint(self) -> str:

@@ -15,10 +15,11 @@ from typing import Any
 import numpy as np
 
 from snakesfm.arrays import Array
-from snakesfm.artifacts.base import Header, atomic_path
+from snakesfm.artifacts.base import Header
 from snakesfm.artifacts.features import LocalFeatures
 from snakesfm.artifacts.images import CalibratedCameras, ImageIndex
 from snakesfm.artifacts.pairs import REJECTIONS, ImagePairs, PairMatches, TwoViewGeometries
+from snakesfm.atomic import atomic_path
 from snakesfm.blocks import choose_blocks, deal_blocks, tile_names
 from snakesfm.config.configuration import options_class
 from snakesfm.config.select_pairs import SelectPairsOptions

@@ -21,7 +21,7 @@ from snakesfm.artifacts import (
     PairMatches,
     ViewGraph,
 )
-from snakesfm.artifacts.base import atomic_path
+from snakesfm.atomic import atomic_path
 from snakesfm.errors import ArtifactError
 
 HEADER = Header("match_pairs", 3, "castle", '{"ratio": 0.8}')
@@ -131,9 +131,12 @@ def test_what_a_killed_writer_left_is_removed_and_a_living_one_is_left_alone(tmp
     child.wait()
     dead = tmp_path / f".a.h5.{os.uname().nodename}.{child.pid}.x.tmp"
     living = tmp_path / f".a.h5.{os.uname().nodename}.{os.getpid()}.x.tmp"
-    elsewhere = tmp_path / f".a.h5.other-host.{child.pid}.x.tmp"
-    for leftover in (dead, living, elsewhere):
+    elsewhere, abandoned = (tmp_path / f".a.h5.other-host.{child.pid}.{name}.tmp" for name in "xy")
+    for leftover in (dead, living, elsewhere, abandoned):
         leftover.write_text("half")
+    now = dead.stat().st_mtime
+    for leftover, days in ((living, 8), (elsewhere, 6), (abandoned, 8)):
+        os.utime(leftover, (now, now - days * 86_400))
     ImagePairs(pairs=[], reasons=[], similarities=[], likenesses=[]).write(path, HEADER)
     assert sorted(tmp_path.iterdir()) == sorted([living, elsewhere, path])
 

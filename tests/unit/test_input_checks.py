@@ -1,17 +1,20 @@
 """Files that a job must not read: they are set aside with one sentence."""
 
+import os
+import resource
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
 
-from snakesfm.artifacts import Header, ImagePairs
+from snakesfm.artifacts import Header, ImagePairs, base
 from snakesfm.artifacts.checks import check_content, check_inputs, set_aside
 from snakesfm.digests import options_digest
-from snakesfm.errors import ArtifactError
+from snakesfm.errors import ArtifactError, UnreadableArtifactError
 
 DIGESTS = {"select_pairs": options_digest(3, '{"a": 1}')}
 
@@ -130,3 +133,53 @@ def test_damage_inside_a_file_is_found_and_nothing_else_touched(tmp_path: Path) 
     assert not bad.exists()
     assert good.is_file()
     assert other.is_file()
+
+
+@contextmanager
+def no_more_files() -> Iterator[None]:
+    """Have the system open no further file for this process."""
+    before = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (3, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, before)
+
+
+def test_a_file_that_cannot_be_read_for_a_moment_stays(tmp_path: Path) -> None:
+    foreign, good = write_pairs(tmp_path / "0-0.h5", scene="t"), write_pairs(tmp_path / "0-1.h5")
+    for check in (lambda: check_inputs([good], "s", DIGESTS), lambda: check_content([good])):
+        with no_more_files(), pytest.raises(UnreadableArtifactError) as caught:
+            check()
+        assert str(caught.value) == (
+            f"{good} cannot be read now (Too many open files): start the same command again."
+        )
+    with no_more_files(), pytest.raises(UnreadableArtifactError):
+        ImagePairs.read(good)
+    assert sorted(tmp_path.iterdir()) == [foreign, good]
+    check_inputs([good], "s", DIGESTS)
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        OSError(5, "Can't synchronously read data (file read failed: errno = 5, error message = '...')"),
+        # as h5py has it of a dataset that cannot be looked up
+        KeyError("Unable to synchronously open object (file read failed: time = now\n, errno = 5, error)"),
+    ],
+)
+def test_columns_that_cannot_be_read_for_a_moment_stay(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: Exception
+) -> None:
+    damaged, good = write_pairs(tmp_path / "0-0.h5"), write_pairs(tmp_path / "0-1.h5")
+    truncate(damaged)
+
+    def fail(file: h5py.File, field: object) -> None:
+        raise error
+
+    monkeypatch.setattr(base, "_read_column", fail)
+    with pytest.raises(UnreadableArtifactError, match=rf"{good} cannot be read now \({os.strerror(5)}\)"):
+        check_content([damaged, good])
+    assert sorted(tmp_path.iterdir()) == [damaged, good]
+    monkeypatch.undo()
+    check_content([good])

@@ -1,5 +1,6 @@
 """What a job reads from standard input, and says where it fails."""
 
+import errno
 import hashlib
 import io
 import json
@@ -57,6 +58,30 @@ def test_a_jobs_memory_is_its_own_and_not_that_of_who_started_it() -> None:
         [sys.executable, "-c", code, report], capture_output=True, text=True, check=True
     ).stdout
     assert 5 < float(out) < 200
+
+
+@pytest.mark.parametrize(
+    ("number", "remedy"),
+    [
+        (errno.ENOSPC, "free the disk or correct the permission, then run again"),
+        (errno.EACCES, "free the disk or correct the permission, then run again"),
+        (errno.EIO, "start the same command again"),
+        (errno.ESTALE, "start the same command again"),
+    ],
+)
+def test_an_error_of_the_system_names_what_helps(
+    monkeypatch: pytest.MonkeyPatch, number: int, remedy: str
+) -> None:
+    monkeypatch.setattr(os, "_exit", lambda status: None)
+    terminal = io.StringIO()
+    error = OSError(number, "many words", "out/a.h5")
+    _fail(
+        Call("match_pairs", {}, {"scene": "s", "outputs": ["out/b.h5"]}, 1, Path("job.log")),
+        error,
+        terminal,
+    )
+    said = f"snakesfm: scene 's', match_pairs: {os.strerror(number)} 'out/a.h5': {remedy}.\n"
+    assert terminal.getvalue() == said
 
 
 def test_a_lack_of_memory_names_what_helps_on_one_machine_too(

@@ -1,13 +1,16 @@
 """What jobs ask a cluster for."""
 
 from pathlib import Path
+from typing import Literal
 
 import pytest
+import yaml
 
 from snakesfm.blocks import choose_blocks
 from snakesfm.config.select_pairs import SelectPairsOptions
 from snakesfm.pipeline import STAGES
 from snakesfm.resources import (
+    FOLLOWING_MIN,
     NEEDS,
     START_MIN,
     UNDISTORTED_MB,
@@ -17,6 +20,7 @@ from snakesfm.resources import (
     job_load,
     memory_mb,
     runtime_min,
+    start_min,
 )
 
 ASKING = (memory_mb, runtime_min)
@@ -75,9 +79,9 @@ def test_the_guide_says_what_groups_of_jobs_ask_for(root: Path, images: int) -> 
         stage: job_load(stage, images, blocks, proposed if stage == "select_pairs" else chosen)
         for stage in STAGES
     }
-    mb, minutes = (
-        {stage: ask(stage, loads[stage]) for stage in STAGES} for ask in (memory_mb, runtime_min)
-    )
+    groups = yaml.safe_load((root / "profiles" / "slurm" / "profile.yaml").read_text())["groups"]
+    mb = {stage: memory_mb(stage, loads[stage]) for stage in STAGES}
+    minutes = {stage: runtime_min(stage, loads[stage], start=start_min(stage, groups)) for stage in STAGES}
     first, last = STAGES.index("build_view_graph"), STAGES.index("adjust_bundle")
     mapping, unused = STAGES[first : last + 1], {"merge_keypoints", "index_matches"}
     # Snakemake adds what jobs that can run side by side ask for, and the times of those that follow
@@ -117,6 +121,26 @@ def test_larger_images_ask_for_what_they_take(side: int, measured_mb: int) -> No
     huge = job_load("extract_features", 100, 4, 3000, shorter_side_px=20_000)
     assert memory_mb("extract_features", huge) < 30_000
     assert job_load("match_pairs", 100, 4, 3000, shorter_side_px=side).area == 1.0
+
+
+def test_of_stages_in_one_job_the_first_takes_the_time_of_the_start() -> None:
+    groups = {"match_pairs": "a", "build_view_graph": "b", "build_tracks": "b", "export_model": "c"}
+    starts = [start_min(stage, groups) for stage in (*groups, "average_rotations")]
+    assert starts == [START_MIN, START_MIN, FOLLOWING_MIN, START_MIN, START_MIN]
+    load = Load(100, 1000)
+    first, following = (runtime_min("build_tracks", load, 2, minutes) for minutes in starts[1:3])
+    assert first - following == 2 * (START_MIN - FOLLOWING_MIN)
+
+
+def test_more_keypoints_ask_for_more_memory() -> None:
+    def ask(stage: str, most: int | Literal["auto"]) -> int:
+        return memory_mb(stage, job_load(stage, 1000, 4, 20_000, max_keypoints=most))
+
+    for stage in STAGES:
+        assert ask(stage, "auto") == ask(stage, 5000) == ask(stage, 100) <= ask(stage, 20_000)
+    # 4.5 MB of each of 1000 images, and what is held of 256
+    assert ask("adjust_bundle", 20_000) - ask("adjust_bundle", 5000) > 3 * 4500
+    assert ask("match_pairs", 20_000) - ask("match_pairs", 5000) > 3 * 160
 
 
 def test_a_network_asks_for_more() -> None:

@@ -12,15 +12,21 @@ import pytest
 from snakemake.common.configfile import load_configfile
 from snakemake_interface_executor_plugins.settings import SharedFSUsage
 
+from snakesfm import slurm
 from snakesfm.errors import ConfigError
-from snakesfm.job_logs import describe_cost
+from snakesfm.job_logs import describe_cost, describe_failures
 from snakesfm.model_files import MODEL_FILES
 from snakesfm.plan import Plan
-from snakesfm.run import CONFIGURATION_NAME, LOCK_NAME, Run
+from snakesfm.run import CONFIGURATION_NAME, IMAGE_COUNTS, LOCK_NAME, Run
 
 MODEL = {"export_model", "evaluate_model"}
 SUMMARY = {"images": 9, "registered_images": 5, "points": 321, "mean_reprojection_error_px": 0.5}
 NOT_FINISHED = "snakesfm: scene 'scene' is not finished: start the same command again."
+SEE_ABOVE = NOT_FINISHED[:-1] + "; if jobs failed, Snakemake's messages above say why."
+WITH_MORE = NOT_FINISHED[:-1] + (
+    "; if memory or time ran out, request more in set-resources of the profile: "
+    "RULE: {mem_mb: MB, runtime: MINUTES}."
+)
 WITH_FEWER_JOBS = (
     NOT_FINISHED[:-1] + "; if memory ran out, with fewer jobs at once: --cores N or --resources mem_mb=MB."
 )
@@ -96,6 +102,55 @@ def test_a_run_holds_its_folder_from_start_to_end(plan: Plan, run: Run) -> None:
     second.lock.close()
 
 
+def test_a_lock_that_outlives_its_machine_names_the_way_out(plan: Plan, run: Run) -> None:
+    path = Path("out", LOCK_NAME)
+    for note, steps in (
+        ("process 1 on n1", ""),
+        ("process 1 on n1, SLURM run a-b", "run 'scancel --name=a-b' and "),
+    ):
+        path.write_text(note)
+        second = Run(plan)
+        with pytest.raises(ConfigError) as refused:
+            second.start()
+        assert str(refused.value).endswith(f"; if its machine is down for good, {steps}delete {path}.")
+        second.lock.close()
+    path.unlink()
+    second.start()
+    second.lock.close()
+
+
+@pytest.mark.parametrize("ends", [True, False])
+def test_an_interrupted_run_leaves_no_slurm_job(
+    plan: Plan, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, ends: bool
+) -> None:
+    left, cancelled = ["7", "8"], []
+
+    def end_jobs(name: str, output: str, lock: str) -> int:
+        cancelled.append(name)
+        if not ends:
+            raise ConfigError(f"SLURM jobs of an interrupted run may still write to '{output}'.")
+        count = len(left)
+        left.clear()
+        return count
+
+    monkeypatch.setattr(slurm, "list_jobs", lambda name: left)
+    run = Run(plan)
+    run.start("name")
+    monkeypatch.setattr(slurm, "end_jobs", end_jobs)
+    # the next run cancels jobs of one that ended in another way
+    run.fail({}, {"scene"}, on_one_machine=False)
+    assert cancelled == [] and "SLURM run name" in Path("out", LOCK_NAME).read_text()
+    run.note_interrupt()
+    capsys.readouterr()
+    run.fail({}, {"scene"}, on_one_machine=False)
+    said = "2 SLURM jobs of an interrupted run were cancelled." if ends else "may still write to 'out'."
+    first, last = capsys.readouterr().out.splitlines()
+    assert first.endswith(said) and last == NOT_FINISHED
+    assert cancelled == ["name"]
+    assert ("SLURM run name" in Path("out", LOCK_NAME).read_text()) != ends
+    run.lock.close()
+
+
 def workflow_of(local_exec: bool, shared: Set[SharedFSUsage]) -> SimpleNamespace:
     """Snakemake's workflow as far as it matters to the configuration, which is from a file."""
     return SimpleNamespace(
@@ -118,10 +173,15 @@ def test_jobs_of_a_cluster_read_the_configuration_that_the_run_keeps(plan: Plan)
     workflow = workflow_of(False, SharedFSUsage.all())
     run.keep_configuration(workflow)
     run.lock.close()
+    # they are of the next run
+    for number in range(61):
+        write(f"scene/late_{number}.jpg")
     kept = Path("2024-05-01", CONFIGURATION_NAME).absolute()
     assert workflow.config_settings.configfiles == [kept]
     assert {file.name for file in kept.parent.iterdir()} == {LOCK_NAME, CONFIGURATION_NAME}
-    again = Plan(load_configfile(kept))
+    told = load_configfile(kept)
+    again = Plan(told, image_counts=told.pop(IMAGE_COUNTS))
+    assert [scene.image_count for scene in again.scenes.values()] == [3, 3]
     assert again.configuration == run.plan.configuration
     assert sorted(again.scenes) == ["2024", "True"]
     assert again.scenes["True"].images == run.plan.scenes["True"].images
@@ -170,9 +230,12 @@ def test_failed_jobs_are_told_by_their_logs(run: Run, capsys: pytest.CaptureFixt
     lines = capsys.readouterr().out.splitlines()
     assert len(lines) == 12
     assert lines[-2:] == ["snakesfm: scene 'scene' failed: 4 more jobs.", WITH_FEWER_JOBS]
-    # a cluster gives a job that is run again more memory
     run.fail({}, {"scene"}, on_one_machine=False)
-    assert capsys.readouterr().out.splitlines()[-1] == NOT_FINISHED
+    assert capsys.readouterr().out.splitlines()[-1] == WITH_MORE
+    # as where SLURM takes no job
+    run.begun = time.time() + 60
+    run.fail({}, {"scene"}, on_one_machine=False)
+    assert capsys.readouterr().out.splitlines() == [SEE_ABOVE]
 
 
 @pytest.mark.parametrize("ahead_s", [-120.0, 120.0])
@@ -189,7 +252,7 @@ def test_logs_of_a_run_are_told_by_the_clock_of_their_file_system(
     monkeypatch.setattr(run, "_bring_times_back", lambda: None)
     run.start()
     write("out/scene/logs/match_pairs/0-1.log", "error: It is full.\n")
-    (sentence,) = run.failures(plan.scenes["scene"])
+    (sentence,) = describe_failures(Path("out", "scene", "logs"), run.begun, False)
     run.lock.close()
     assert sentence.startswith("It is full.")
 

@@ -11,8 +11,7 @@ from pathlib import Path
 import pytest
 from workflow_runner import Workflow, config_of, copy_run, model_bytes
 
-from snakesfm.plan import Plan
-from snakesfm.run import Run
+from snakesfm.job_logs import describe_failures
 from snakesfm.start import NO_SERVER, VARIABLE
 
 pytestmark = pytest.mark.workflow
@@ -56,7 +55,7 @@ def test_a_controller_that_gets_term_while_it_deals_with_ended_jobs_ends(
     assert "rule match_pairs" in ended.stdout and "rule adjust_bundle" not in ended.stdout
     lines = [line for line in ended.stdout.splitlines() if line.startswith("snakesfm: scene")]
     # all results of the former options are still there
-    assert lines[-1] == "snakesfm: scene 'square' is not finished: start the same command again."
+    assert lines[-1].startswith("snakesfm: scene 'square' is not finished: start the same command again; ")
     again = workflow.run(*config_of(small_scene))
     assert again.status == 0, again.text
     assert "16 of 16 images registered" in again.summary[-1]
@@ -112,17 +111,14 @@ def test_a_run_without_a_standard_stream_ends_well_and_has_its_logs(
     assert [lines[place].split()[1] for place in (0, -1)] == ["evaluate_model"] * 2
 
 
-def test_a_job_that_was_killed_before_its_first_line_is_named(
-    finished, small_scene: Path, workflow: Workflow
-) -> None:
+def test_a_job_that_was_killed_before_its_first_line_is_named(finished, workflow: Workflow) -> None:
     copy_run(finished[0], workflow.folder)
-    plan = Plan({"output": str(workflow.folder / "out"), "images": str(small_scene / "images")})
-    scene, run = plan.scenes["square"], Run(plan)
-    assert run.failures(scene) == []
-    log = workflow.folder / "out" / "square" / "logs" / "match_pairs" / "0-0.log"
+    logs, now = workflow.folder / "out" / "square" / "logs", time.time()
+    assert describe_failures(logs, now, False) == []
+    log = logs / "match_pairs" / "0-0.log"
     log.write_bytes(b"")
-    os.utime(log, (run.started + 1, run.started + 1))
-    (sentence,) = run.failures(scene)
+    os.utime(log, (now + 1, now + 1))
+    (sentence,) = describe_failures(logs, now, False)
     assert sentence.startswith("match_pairs 0-0 was killed from outside") and str(log) in sentence
 
 

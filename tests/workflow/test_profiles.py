@@ -9,6 +9,7 @@ from extras import import_extra
 from workflow_runner import Workflow
 
 from snakesfm.pipeline import STAGES
+from snakesfm.resources import FOLLOWING_MIN, START_MIN
 from snakesfm.scene_plan import STAGES_WITH_NETWORKS
 
 pytestmark = pytest.mark.workflow
@@ -76,7 +77,7 @@ def test_the_readme_explains_every_value(root: Path, name: str) -> None:
 
 
 @pytest.mark.parametrize("name", CLUSTERS)
-def test_jobs_ask_for_memory_and_time(small_scene: Path, tmp_path: Path, name: str) -> None:
+def test_jobs_ask_for_memory_and_time(root: Path, small_scene: Path, tmp_path: Path, name: str) -> None:
     extra = name.split("-")[0]
     import_extra(f"snakemake_executor_plugin_{extra}", extra)
     storage = ["--default-storage-prefix", str(tmp_path)] if name == "kubernetes" else []
@@ -94,7 +95,12 @@ def test_jobs_ask_for_memory_and_time(small_scene: Path, tmp_path: Path, name: s
     assert (len(plain), len(larger)) == ((16, 5) if name == "kubernetes" else (21, 0))
     for need in asking:
         assert 500 <= int(re.search(r"mem_mb=(\d+)", need)[1]) <= 3_000
-        assert 15 <= int(re.search(r"runtime=(\d+)", need)[1]) <= 30
+    minutes = re.findall(r"^ *rule (\w+):$(?:\n.+)*?\n *resources: .*runtime=(\d+)", outcome.text, re.M)
+    assert len(minutes) == 21
+    following = read_profile(root, name)["groups"].keys() - {"build_view_graph", "export_model"}
+    for rule, count in minutes:
+        least, most = (FOLLOWING_MIN, START_MIN) if rule in following else (START_MIN, 30)
+        assert least < int(count) < most, rule
     assert not [need for need in needs if "gpu=1" in need]
 
 

@@ -74,6 +74,15 @@ class Storm:
         self.logs = scene / "logs"
         self.victims: dict[str, str] = {}
 
+    def preempt(self) -> None:
+        """Have a more important job take the node of one that finds features."""
+        pid, number = wait_for_process(self.logs / "extract_features" / "0.log")
+        self.victims["preempted"] = number
+        os.kill(pid, signal.SIGSTOP)
+        node = self.cluster.job(number)["NodeList"]
+        taking = ("--partition=urgent", f"--nodelist={node}", "--exclusive", "--mem=1000")
+        self.cluster.call("sbatch", *taking, "--output=/dev/null", "--wrap=true")
+
     def hang(self) -> None:
         """Stop the process of a tile for ever."""
         pid, self.victims["hung"] = wait_for_process(self.logs / "match_pairs" / "0-0.log")
@@ -114,7 +123,7 @@ def survived(
         *config_of(small_scene),
     )
     storm = Storm(cluster, folder / "out" / "square")
-    faults = [storm.hang, storm.cancel, storm.lose_node]
+    faults = [storm.preempt, storm.hang, storm.cancel, storm.lose_node]
     threads = [threading.Thread(target=fault, daemon=True) for fault in faults]
     for thread in threads:
         thread.start()
@@ -143,12 +152,18 @@ def test_logs_of_all_jobs_are_with_the_scene(finished, survived) -> None:
 
 
 @pytest.mark.parametrize(
-    ("fault", "state"), [("hung", "TIMEOUT"), ("cancelled", "CANCELLED"), ("lost", "NODE_FAIL")]
+    ("fault", "state"),
+    [
+        ("preempted", "PREEMPTED"),
+        ("hung", "TIMEOUT"),
+        ("cancelled", "CANCELLED"),
+        ("lost", "NODE_FAIL"),
+    ],
 )
 def test_a_job_that_was_hit_is_run_again(cluster: Cluster, survived, fault: str, state: str) -> None:
     number = survived[2][fault]
     assert cluster.job(number)["JobState"] == state
-    assert f"SLURM-job '{number}' failed" in survived[1]
+    assert re.search(rf"SLURM-job '{number}' (failed|was preempted)", survived[1])
 
 
 def test_a_job_over_its_time_gets_more(cluster: Cluster, survived) -> None:
@@ -195,6 +210,43 @@ def test_a_controller_that_is_ended_leaves_nothing_that_hinders_the_next(
     assert cluster.job(job)["JobState"] == "CANCELLED"
     assert model_bytes(output) == model_bytes(finished[0])
     assert not list(output.rglob("*.tmp"))
+
+
+def test_a_job_that_slurm_will_not_start_is_named(
+    finished, small_scene: Path, cluster: Cluster, on_slurm: Workflow
+) -> None:
+    copy_run(finished[0], on_slurm.folder)
+    (on_slurm.folder / "out" / "square" / "render_report" / "index.html").unlink()
+    limited = ("--default-resources", "slurm_partition=short", "disk_mb=1000")
+    run = on_slurm.start(*QUICK, *limited, *config_of(small_scene))
+    wait_for(lambda: cluster.jobs("PENDING"), "a job that is longer than its partition allows", 120)
+    # so many seconds later jobs are asked for
+    time.sleep(10)
+    run.send_signal(signal.SIGINT)
+    text, _ = run.communicate(timeout=120)
+    assert re.search(r"SLURM does not start job \d+ \(render_report\): PartitionTimeLimit\.", text), text
+    assert cluster.jobs() == []
+
+
+def test_an_interrupt_while_jobs_are_submitted_leaves_none(
+    finished, small_scene: Path, cluster: Cluster, tmp_path: Path
+) -> None:
+    copy_run(finished[0], tmp_path)
+    output, programs = tmp_path / "out" / "square", tmp_path / "bin"
+    for block in range(2):
+        (output / "extract_features" / f"{block}.h5").unlink()
+    programs.mkdir()
+    slow = programs / "sbatch"
+    slow.write_text(f'#!/bin/sh\ntouch {tmp_path}/asked\nsleep 4\nexec {cluster.folder}/bin/sbatch "$@"\n')
+    slow.chmod(0o755)
+    environment = {**cluster.environment, "PATH": f"{programs}:{cluster.environment['PATH']}"}
+    run = Workflow(tmp_path, "slurm", environment).start(*QUICK, *config_of(small_scene))
+    wait_for((tmp_path / "asked").exists, "a job that is being submitted", 120)
+    run.send_signal(signal.SIGINT)
+    text, _ = run.communicate(timeout=120)
+    assert "2 SLURM jobs of an interrupted run were cancelled." in text
+    assert cluster.jobs() == []
+    assert (tmp_path / "out" / ".snakesfm.lock").read_text() == ""
 
 
 def test_what_is_edited_while_a_run_goes_on_is_for_the_next(

@@ -25,7 +25,7 @@ from snakesfm.records import (
     split_words,
 )
 from snakesfm.rule_settings import check_named_together, share_resources
-from snakesfm.run import Run
+from snakesfm.run import IMAGE_COUNTS, Run
 from snakesfm.scene_checks import check_results
 from snakesfm.scene_plan import ScenePlan
 from snakesfm.termination import answer_interrupt, answer_term_aside
@@ -48,7 +48,9 @@ try:
         check_given_once(sys.argv[1:])
         check_keys(workflow.overwrite_configfiles)
     check_spelling(config, sys.argv[1:])
-    PLAN = Plan(config, weights_only="fetch_weights" in asked)
+    # jobs are told how many images there were when the run was planned
+    counted = {} if workflow.is_main_process else config.pop(IMAGE_COUNTS, {})
+    PLAN = Plan(config, "fetch_weights" in asked, counted)
     if workflow.is_main_process:
         check_named_together(words, "select_pairs", PLAN.select_pairs_twins())
         for planned in PLAN.scenes.values():
@@ -184,7 +186,14 @@ def memory_mb(stage):
 
 def runtime_min(stage):
     """A resource function: the minutes that a job asks a cluster for."""
-    return asking(resources.runtime_min, stage)
+
+    def need(stage, load, attempt):
+        # Snakemake knows them only when it has read the Snakefile
+        groups = workflow.group_settings.overwrite_groups
+        start = resources.start_min(stage, groups)
+        return resources.runtime_min(stage, load, attempt, start)
+
+    return asking(need, stage)
 
 
 def asking(need, stage):

@@ -1,6 +1,6 @@
 """The files between the stages: one dataclass per kind, with its reader and writer."""
 
-from snakesfm.artifacts.base import Artifact, Header, atomic_path, read_header, temporary_folder, write_json
+from snakesfm.artifacts.base import Artifact, Header, read_header, temporary_folder, write_json
 from snakesfm.artifacts.features import GlobalDescriptors, LocalFeatures, Vocabulary
 from snakesfm.artifacts.images import CalibratedCameras, ImageIndex
 from snakesfm.artifacts.mapping import (
@@ -49,7 +49,6 @@ __all__ = [
     "TwoViewGeometries",
     "ViewGraph",
     "Vocabulary",
-    "atomic_path",
     "read_header",
     "temporary_folder",
     "write_json",

@@ -6,8 +6,10 @@ temporary name in the same folder and renamed, so a file that is there is comple
 """
 
 import dataclasses
+import errno
 import json
 import os
+import re
 import shutil
 import tempfile
 import zlib
@@ -22,7 +24,8 @@ import numpy as np
 
 import snakesfm
 from snakesfm.arrays import Array
-from snakesfm.errors import ArtifactError
+from snakesfm.atomic import atomic_path
+from snakesfm.errors import ArtifactError, UnreadableArtifactError, remedy_of
 
 TEMPORARY = ".export."
 STRING = h5py.string_dtype("utf-8")
@@ -137,7 +140,8 @@ class Artifact:
 
         Raises
         ------
-        ArtifactError : the file is missing, damaged, of another kind or of another version.
+        ArtifactError : the file is missing, damaged, of another kind or of another version, or cannot be
+            read now.
         """
         with cls.open(path) as file:
             try:
@@ -146,15 +150,22 @@ class Artifact:
                 if made is None or made == checksum(values.values()):
                     return cls(**values)
             # what h5py raises on damage has no common kind
-            except (KeyError, OSError, RuntimeError, ValueError, TypeError):
-                pass
+            except (KeyError, OSError, RuntimeError, ValueError, TypeError) as error:
+                _refuse_unreadable(path, error)
         raise ArtifactError(f"{path} is damaged: delete it and run snakemake again.")
 
     @classmethod
     def read_former(cls, path: Path | None) -> Self | None:
-        """Read an earlier version of a stage's output; None where there is none that can be read."""
+        """Read an earlier version of a stage's output; None where there is none, or it is damaged.
+
+        Raises
+        ------
+        UnreadableArtifactError : the system cannot read it now.
+        """
         try:
             return cls.read(path) if path is not None else None
+        except UnreadableArtifactError:
+            raise
         except ArtifactError:
             return None
 
@@ -164,7 +175,8 @@ class Artifact:
 
         Raises
         ------
-        ArtifactError : the file is missing, damaged, of another kind or of another version.
+        ArtifactError : the file is missing, damaged, of another kind or of another version, or cannot be
+            read now.
         """
         file = None
         try:
@@ -173,9 +185,10 @@ class Artifact:
         except FileNotFoundError:
             raise ArtifactError(f"{path} is missing: run snakemake again to make it.") from None
         # what h5py raises on damage has no common kind
-        except Exception:
+        except Exception as error:
             if file is not None:
                 file.close()
+            _refuse_unreadable(path, error)
             raise ArtifactError(
                 f"{path} is damaged or not an HDF5 file: delete it and run snakemake again."
             ) from None
@@ -205,46 +218,36 @@ def checksum(columns: Iterable[Array]) -> int:
 
 
 def read_header(path: Path | str) -> Mapping[str, Any]:
-    """The root attributes of an artifact's file; empty where it cannot be read."""
+    """The root attributes of an artifact's file; empty where it is missing or damaged.
+
+    Raises
+    ------
+    UnreadableArtifactError : the system cannot read it now.
+    """
     try:
         with h5py.File(path, "r", locking=False) as file:
             header = dict(file.attrs)
         # text with bytes that are no UTF-8 can be neither digested nor printed
         "".join(map(str, header.values())).encode()
-    except Exception:
+    except Exception as error:
+        _refuse_unreadable(path, error)
         return {}
     return header
 
 
-class atomic_path:  # noqa: N801 - used as a function, like contextlib's
-    """Context manager: yields a temporary path beside ``path`` and renames it on success.
+def _refuse_unreadable(path: Path | str, error: Exception) -> None:
+    """Raise where the system failed to read a file, as for a moment on one node: it may be healthy.
 
-    What writers that were killed on this machine left of the same file is removed.
+    HDF5 then gives the system's number, with some errors in their text alone, and with none of a file that
+    is damaged.
     """
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-
-    def __enter__(self) -> Path:
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        _remove_leftovers(self.path)
-        handle, name = tempfile.mkstemp(
-            prefix=f".{self.path.name}.{os.uname().nodename}.{os.getpid()}.",
-            suffix=".tmp",
-            dir=self.path.parent,
-        )
-        os.close(handle)
-        self.temporary = Path(name)
-        self.temporary.chmod(0o666 & ~_umask())
-        return self.temporary
-
-    def __exit__(self, kind: object, error: object, trace: object) -> None:
-        if kind is None:
-            with self.temporary.open("rb+") as file:
-                os.fsync(file.fileno())
-            self.temporary.replace(self.path)
-        else:
-            self.temporary.unlink(missing_ok=True)
+    found = re.search(r"\berrno = (\d+)", str(error))
+    number = int(found[1]) if found else getattr(error, "errno", None)
+    if number and number != errno.ENOENT:
+        reason = os.strerror(number)
+        raise UnreadableArtifactError(
+            f"{path} cannot be read now ({reason}): {remedy_of(number)}."
+        ) from None
 
 
 @contextmanager
@@ -258,33 +261,6 @@ def temporary_folder(folder: Path) -> Iterator[Path]:
         shutil.rmtree(leftover)
     with tempfile.TemporaryDirectory(prefix=TEMPORARY, dir=folder) as name:
         yield Path(name)
-
-
-def _remove_leftovers(path: Path) -> None:
-    """Remove temporary files of ``path`` whose writer ran on this machine and is gone."""
-    host = os.uname().nodename
-    start = f".{path.name}.{host}."
-    for leftover in path.parent.iterdir():
-        if leftover.name.startswith(start) and leftover.name.endswith(".tmp"):
-            pid = leftover.name[len(start) :].split(".")[0]
-            if pid.isdigit() and not _is_alive(int(pid)):
-                leftover.unlink(missing_ok=True)
-
-
-def _is_alive(pid: int) -> bool:
-    try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return False
-    except PermissionError:
-        return True
-    return True
-
-
-def _umask() -> int:
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask
 
 
 def write_json(path: Path, content: Any) -> None:

@@ -25,7 +25,7 @@ def check_inputs(paths: Iterable[Path], scene: str, digests: Mapping[str, str]) 
 
     Raises
     ------
-    ArtifactError : at least one file was set aside.
+    ArtifactError : at least one file was set aside; or one cannot be read now, and none was.
     """
     _raise_for(set_aside(paths, scene, digests))
 
@@ -39,15 +39,15 @@ def check_content(paths: Iterable[Path]) -> None:
 
     Raises
     ------
-    ArtifactError : at least one file was set aside.
+    ArtifactError : at least one file was set aside; or one cannot be read now, and none was.
     """
     kinds = {cls.kind: cls for cls in ARTIFACTS}
-    refused = []
+    damaged = []
     for path in paths:
         cls = kinds.get(str(read_header(path).get("artifact"))) if path.suffix == ".h5" else None
         if cls is not None and cls.read_former(path) is None:
-            refused.append(_rename(path, "is damaged"))
-    _raise_for(refused)
+            damaged.append(path)
+    _raise_for([_rename(path, "is damaged") for path in damaged])
 
 
 def set_aside(
@@ -67,13 +67,14 @@ def set_aside(
     Returns
     -------
     One clause per file that was renamed.
+
+    Raises
+    ------
+    UnreadableArtifactError : a file cannot be read now; none was renamed.
     """
-    refused = []
-    for path in paths:
-        reason = _reason(path, scene, digests, settings) if path.suffix == ".h5" and path.is_file() else ""
-        if reason:
-            refused.append(_rename(path, reason))
-    return refused
+    files = [path for path in paths if path.suffix == ".h5" and path.is_file()]
+    reasons = [_reason(path, scene, digests, settings) for path in files]
+    return [_rename(path, reason) for path, reason in zip(files, reasons, strict=True) if reason]
 
 
 def _rename(path: Path, reason: str) -> str:

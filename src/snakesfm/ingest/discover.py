@@ -3,15 +3,16 @@
 The Snakefile asks this while it is parsed, so only light modules of the standard library are imported.
 """
 
+import contextlib
 import hashlib
 import json
 import os
-import tempfile
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import islice
 from pathlib import Path, PurePosixPath
 
+from snakesfm.atomic import atomic_path
 from snakesfm.digests import sha256_of
 from snakesfm.errors import ConfigError
 
@@ -22,6 +23,7 @@ UNREAD_SUFFIXES = (
     *(".arw", ".cr2", ".cr3", ".dng", ".nef", ".orf", ".raf", ".rw2"),
 )
 VIDEO_SUFFIXES = (".avi", ".mkv", ".mov", ".mp4")
+DIGESTS_NAME = "digests.json"
 MASK_DIGESTS_NAME = "mask_digests.json"
 CACHE_VERSION = 2
 # a file that was written so shortly before may change again within one tick of the file system's clock
@@ -226,14 +228,6 @@ def _write_cache(cache_file: Path, root: str, known: dict[str, tuple[Stamp, str]
         "folder": root,
         "files": {name: (*stamp, digest) for name, (stamp, digest) in known.items()},
     }
-    temporary = ""
-    try:
-        cache_file.parent.mkdir(parents=True, exist_ok=True)
-        handle, temporary = tempfile.mkstemp(prefix=f".{cache_file.name}.", dir=cache_file.parent)
-        with os.fdopen(handle, "w", encoding="utf-8") as file:
-            json.dump(content, file, separators=(",", ":"))
-        Path(temporary).replace(cache_file)
-    except OSError:
-        # without the cache everything still works, only slower
-        if temporary:
-            Path(temporary).unlink(missing_ok=True)
+    # without the cache everything still works, only slower
+    with contextlib.suppress(OSError), atomic_path(cache_file) as temporary:
+        temporary.write_text(json.dumps(content, separators=(",", ":")), "utf-8")

@@ -5,6 +5,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+from snakesfm.atomic import atomic_path
 from snakesfm.digests import sha256_of
 from snakesfm.errors import ConfigError
 
@@ -153,9 +154,8 @@ def read_sums(folder: Path) -> dict[str, str]:
 def write_sums(folder: Path, sums: Mapping[str, str]) -> None:
     """Record sums by file name, so that ``sha256sum -c SHA256SUMS`` checks the folder."""
     text = "".join(f"{digest}  {name}\n" for name, digest in sorted(sums.items()))
-    temporary = folder / f".{SUMS_NAME}.tmp"
-    temporary.write_text(text, "utf-8")
-    temporary.replace(folder / SUMS_NAME)
+    with atomic_path(folder / SUMS_NAME) as temporary:
+        temporary.write_text(text, "utf-8")
 
 
 def weights_digest(models: Iterable[str], folder: Path) -> str:

@@ -68,9 +68,8 @@ def run(job: StageJob) -> None:
     former = job.take_over(digests, _read_former)
     progress = job.progress(len(pairs), "pairs")
     rows: list[Row] = []
-    reused = 0
     for k, (i, j) in enumerate(pairs):
-        row = former.get(digests[k])
+        row = former.get(k)
         if row is None:
             estimate = estimate_two_view_geometry(
                 keypoints[i],
@@ -81,12 +80,10 @@ def run(job: StageJob) -> None:
                 seeds[k],
             )
             row = _to_row(estimate)
-        else:
-            reused += 1
         rows.append(row | {"digests": digests[k]})
         progress.step()
     _assemble(matches.pairs, rows).write(job.output, job.header)
-    print(_summary(rows, reused), flush=True)
+    print(_summary(rows, len(former)), flush=True)
 
 
 def _best_first(matches: PairMatches, pair: int) -> Array:

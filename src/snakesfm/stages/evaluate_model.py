@@ -5,7 +5,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from snakesfm.artifacts import ImageIndex, Reconstruction, atomic_path, write_json
+from snakesfm.artifacts import ImageIndex, Reconstruction, write_json
+from snakesfm.atomic import atomic_path
 from snakesfm.evaluation.metrics import Poses, evaluate_poses, model_metrics
 from snakesfm.stages.job import StageJob
 

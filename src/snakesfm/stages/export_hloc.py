@@ -7,8 +7,9 @@ import h5py
 import numpy as np
 
 from snakesfm.arrays import Array
-from snakesfm.artifacts import ImageIndex, LocalFeatures, PairMatches, TwoViewGeometries, atomic_path
+from snakesfm.artifacts import ImageIndex, LocalFeatures, PairMatches, TwoViewGeometries
 from snakesfm.artifacts.hloc import clashing_names, write_hloc_features, write_hloc_matches
+from snakesfm.atomic import atomic_path
 from snakesfm.errors import ConfigError
 from snakesfm.stages.job import StageJob
 

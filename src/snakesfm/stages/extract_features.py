@@ -74,10 +74,10 @@ def run(job: StageJob) -> None:
         result_digest(options, beside + contents.get(name, "") + (name if named else ""), str(sha256))
         for sha256, name in zip(index.sha256[rows], names, strict=True)
     ]
-    former = job.take_over(digests, _read_former)
+    results = job.take_over(digests, _read_former)
+    reused = len(results)
     progress = job.progress(len(rows), "images")
-    results = {place: former[digest] for place, digest in enumerate(digests) if digest in former}
-    progress.step(len(results))
+    progress.step(reused)
     missing = [place for place in range(len(rows)) if place not in results]
     sizes = [(width, height) for width, height in index.sizes[rows].tolist()]
     for batch in in_batches([sizes[place] for place in missing], job.network_batch()):
@@ -90,7 +90,6 @@ def run(job: StageJob) -> None:
     ordered = [results[place] for place in range(len(rows))]
     _collect(index, rows, digests, ordered, finder).write(job.output, told.header)
     counts = [len(result.points) for result in ordered]
-    reused = sum(digest in former for digest in digests)
     bare = [name for name, count in zip(names, counts, strict=True) if count == 0]
     if bare:
         job.warn(

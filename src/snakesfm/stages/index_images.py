@@ -14,7 +14,13 @@ from snakesfm.blocks import deal_blocks
 from snakesfm.errors import ImageError, SceneError, UnreadableImageError
 from snakesfm.geometry.camera import cameras_to_columns
 from snakesfm.ingest.cameras import ImageCameras, Photograph, assign_cameras, warn_of_own_cameras
-from snakesfm.ingest.discover import digest_images, fingerprint, list_photographs, resolved_name
+from snakesfm.ingest.discover import (
+    DIGESTS_NAME,
+    digest_images,
+    fingerprint,
+    list_photographs,
+    resolved_name,
+)
 from snakesfm.ingest.known import match_known_cameras, read_known_cameras
 from snakesfm.ingest.read import read_header
 from snakesfm.stages.job import StageJob
@@ -22,7 +28,6 @@ from snakesfm.stages.job import StageJob
 if TYPE_CHECKING:
     from snakesfm.config.index_images import IndexImagesOptions
 
-DIGESTS_NAME = "digests.json"
 FLICKERS = "{path} could be read at one moment and not at another: start the same command again."
 UNREAD = "{path} has an unsupported format: convert it to JPEG."
 

@@ -147,8 +147,8 @@ class StageJob:
 
     def take_over(
         self, digests: Sequence[str], read: Callable[[Path, set[str]], Mapping[str, Any]]
-    ) -> dict[str, Any]:
-        """Results of unchanged images or pairs, from the former file and the folder that runs share.
+    ) -> dict[int, Any]:
+        """Results of unchanged images or pairs by their place, from the former file and the shared folder.
 
         Parameters
         ----------
@@ -172,7 +172,7 @@ class StageJob:
             if path == cached and not wanted <= found.keys():
                 # its name promises all of them
                 self.distrusted.add(path)
-        return taken
+        return {place: taken[digest] for place, digest in enumerate(digests) if digest in taken}
 
     def warn(self, sentence: str) -> None:
         """Say a warning in the log and on the terminal, where a stage's result has no place for it.

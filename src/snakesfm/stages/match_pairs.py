@@ -66,8 +66,7 @@ def run(job: StageJob) -> None:
         digests = [
             result_digest(options, beside, source.digests[i], source.digests[j]) for i, j in pairs.tolist()
         ]
-        former = job.take_over(digests, functools.partial(_read_former, kind))
-        results = {row: former[digest] for row, digest in enumerate(digests) if digest in former}
+        results = job.take_over(digests, functools.partial(_read_former, kind))
         reused = len(results)
         progress = job.progress(len(pairs) - reused, "pairs")
         read_second = functools.lru_cache(HELD_IMAGES)(lambda j: matcher.prepare_second(source.read(j)))

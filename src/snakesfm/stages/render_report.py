@@ -21,10 +21,10 @@ from snakesfm.artifacts import (
     TriangulatedPoints,
     TwoViewGeometries,
     ViewGraph,
-    atomic_path,
     read_header,
 )
 from snakesfm.artifacts.pairs import EDGE_LABELS, KINDS, REJECTIONS
+from snakesfm.atomic import atomic_path
 from snakesfm.geometry.camera import cameras_from_columns, observation_errors
 from snakesfm.grouping import rows_of_each
 from snakesfm.job_logs import stage_costs
