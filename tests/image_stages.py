@@ -126,6 +126,7 @@ class Scene:
             inputs = {
                 "pairs": self.tile_files("pairs")[tile],
                 "features": [self.block_files("features")[block] for block in blocks],
+                "index": [],
             }
             match_pairs.run(
                 self.job(

@@ -1,6 +1,7 @@
 """Rows of arrays that belong together."""
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -25,6 +26,18 @@ def offsets_of(lengths: ArrayLike) -> Array:
     lengths : (n,) int, rows of each group.
     """
     return np.concatenate([[0], np.cumsum(lengths, dtype=np.int64)])
+
+
+def join_parts(parts: Sequence[Sequence[Array]], nothing: Sequence[Array]) -> tuple[Array, list[Array]]:
+    """Offsets (n+1,) of parts that follow each other, and each of their columns as one array.
+
+    Parameters
+    ----------
+    parts : n of them, each of columns with equally many rows.
+    nothing : a part without rows, whose columns keep shapes and dtypes where there is no part.
+    """
+    columns = [np.concatenate(column) for column in zip(nothing, *parts, strict=True)]
+    return offsets_of([len(part[0]) for part in parts]), columns
 
 
 def sum_by(values: Array, groups: Array, count: int) -> Array:

@@ -1,6 +1,7 @@
 """The files that jobs of a scene, tile or block read, where these depend on the scene's methods."""
 
 from snakesfm.blocks import tile_names
+from snakesfm.front_ends import LEARNED_METHODS
 from snakesfm.scene_plan import ScenePlan
 
 
@@ -41,8 +42,9 @@ def matched_features(scene: ScenePlan, tile: str) -> list[str]:
 
 
 def matched_images(scene: ScenePlan) -> list[str]:
-    """The index where a tile matches images instead of keypoints, else nothing."""
-    return [scene.file("index_images", "index")] if scene.detector_free else []
+    """The index where a tile matches images, or their keypoints by a network, else nothing."""
+    needed = scene.detector_free or scene.method("match_pairs") in LEARNED_METHODS
+    return [scene.file("index_images", "index")] if needed else []
 
 
 def block_tiles(scene: ScenePlan, block: str) -> list[str]:

@@ -1,5 +1,6 @@
 """What every matcher without keypoints must do."""
 
+from dataclasses import replace
 from typing import ClassVar
 
 import numpy as np
@@ -10,12 +11,12 @@ from extras import import_extra
 from snakesfm.evaluation.colmap_model import read_model
 from snakesfm.features.virtual import VirtualKeypoints
 from snakesfm.matching.detector_free import DETECTOR_FREE_MATCHERS, Picture
-from snakesfm.matching.loftr import shrink
+from snakesfm.matching.loftr import HELD_FEATURES, shrink
 
 
-def picture(gray, name, reduction=1):
+def picture(gray, name, reduction=1, orientation=1):
     size = (gray.shape[1] * reduction, gray.shape[0] * reduction)
-    return Picture(name, size, gray, np.repeat(gray[..., None], 3, axis=2))
+    return Picture(name, size, gray, np.repeat(gray[..., None], 3, axis=2), reduction, orientation)
 
 
 class DetectorFreeContract:
@@ -111,7 +112,32 @@ class TestLoftr(DetectorFreeContract):
             assert small.gray is None
             return
         assert small.gray.shape == seen
-        np.testing.assert_allclose(small.ratios * seen[::-1], shape[::-1])
+        np.testing.assert_allclose(small.to_stored(np.array([seen[::-1]])), [shape[::-1]])
+
+    def test_a_picture_is_matched_as_it_is_shown(self, matcher, pictures):
+        expected, scores = self.match(matcher, pictures[0], pictures[0])
+        lying = picture(np.ascontiguousarray(np.rot90(pictures[0].gray)), "lying", 2, orientation=6)
+        coordinates, again = self.match(matcher, pictures[0], lying)
+        np.testing.assert_allclose(coordinates[:, :2], expected[:, :2])
+        x, y = expected[:, 2:].T
+        np.testing.assert_allclose(coordinates[:, 2:], 2 * np.column_stack([y, 128 - x]), rtol=1e-5)
+        np.testing.assert_array_equal(again, scores)
+
+    def test_an_image_is_seen_once_for_several_pairs(self, matcher, pictures, monkeypatch):
+        seen = []
+        network = matcher._network
+        original = network.extract_features
+        monkeypatch.setattr(
+            network, "extract_features", lambda image: seen.append(image.shape) or original(image)
+        )
+        renamed = [replace(part, name=f"once {part.name}") for part in pictures]
+        for i, j in ((0, 1), (0, 2), (1, 2)):
+            self.match(matcher, renamed[i], renamed[j])
+        assert len(seen) == 3
+        for number in range(HELD_FEATURES):
+            self.match(matcher, renamed[2], replace(pictures[0], name=f"more {number}"))
+        self.match(matcher, renamed[2], renamed[0])
+        assert len(seen) == 3 + HELD_FEATURES + 1
 
     def test_long_images_are_matched(self, matcher):
         long = picture(shapes(960, 70)[0], "long")

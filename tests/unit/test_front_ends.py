@@ -236,6 +236,8 @@ def test_without_keypoints_the_stages_after_matching_read_merged_ones(tmp_path: 
     assert sift.features_stage == "extract_features" and sift.matches_stage == "match_pairs"
     assert not any("merge_keypoints" in file for file in sift.all_files())
     assert matched_features(sift, "0-1") == tile_features(sift, "0-1") == keypoint_files(sift)
+    (network,) = plan_of(tmp_path, front_end="xfeat+lighterglue", weights="w").scenes.values()
+    assert matched_images(network) == matched_images(scene) and coordinate_files(network) == []
     assert matched_images(sift) == coordinate_files(sift) == exported_keypoints(sift) == []
     (complete,) = plan_of(tmp_path, export_model={"all_keypoints": True}).scenes.values()
     assert exported_keypoints(complete) == keypoint_files(sift)

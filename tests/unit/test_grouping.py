@@ -3,13 +3,24 @@
 import numpy as np
 import pytest
 
-from snakesfm.grouping import components_of, offsets_of, one_to_one, sum_by
+from snakesfm.grouping import components_of, join_parts, offsets_of, one_to_one, sum_by
 
 
 def test_offsets_begin_at_zero_and_are_wide_integers() -> None:
     assert offsets_of([3, 0, 2]).tolist() == [0, 3, 3, 5]
     for few in ([], np.zeros(0), np.array([2**31 - 1, 1], np.int32), np.array([200, 100], np.uint8)):
         assert offsets_of(few).dtype == np.int64 and offsets_of(few)[-1] == sum(map(int, few))
+
+
+def test_parts_are_joined_and_none_keep_shapes_and_dtypes() -> None:
+    nothing = (np.zeros((0, 2), np.int32), np.zeros(0, np.float32))
+    parts = [(np.full((n, 2), n, np.int32), np.full(n, n, np.float32)) for n in (2, 0, 1)]
+    offsets, (pairs, values) = join_parts(parts, nothing)
+    assert offsets.tolist() == [0, 2, 2, 3]
+    assert pairs.tolist() == [[2, 2], [2, 2], [1, 1]] and values.tolist() == [2, 2, 1]
+    offsets, columns = join_parts([], nothing)
+    assert offsets.tolist() == [0] and offsets.dtype == np.int64
+    assert [(part.shape, part.dtype) for part in columns] == [((0, 2), np.int32), ((0,), np.float32)]
 
 
 @pytest.mark.parametrize("shape", [(), (3,), (3, 3)])

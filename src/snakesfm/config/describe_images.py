@@ -10,7 +10,7 @@ from snakesfm.config.base import StageOptions
 class DescribeImagesOptions(StageOptions):
     """How an image is summarised in one vector."""
 
-    stage_version: ClassVar[int] = 3
+    stage_version: ClassVar[int] = 4
 
     method: Literal["vlad", "netvlad", "megaloc"] = "vlad"
     """Global descriptor: VLAD of the local descriptors, or a network applied to the whole image."""

@@ -11,7 +11,7 @@ from snakesfm.geometry.detector_sides import USUAL_SIDE_PX
 class ExtractFeaturesOptions(StageOptions):
     """How keypoints are found and described."""
 
-    stage_version: ClassVar[int] = 5
+    stage_version: ClassVar[int] = 6
 
     method: Literal["sift", "aliked", "disk", "xfeat", "superpoint", "virtual", "imported"] = "sift"
     """SIFT with RootSIFT descriptors, a network, an oracle, or hloc's file; see docs/front_ends.md."""
@@ -38,7 +38,7 @@ class ExtractFeaturesOptions(StageOptions):
 
     upright: bool = False
     """Describe keypoints without their orientation: more matches, but none between images rotated about
-    the viewing axis."""
+    the viewing axis. EXIF orientations are heeded."""
 
     edge_threshold: float = Field(10.0, gt=1.0, le=100.0)
     """Largest ratio of principal curvatures of a SIFT keypoint; lower values reject more points on

@@ -11,7 +11,7 @@ from snakesfm.front_ends import DETECTOR_FREE
 class MatchPairsOptions(StageOptions):
     """How the descriptors of two images are matched."""
 
-    stage_version: ClassVar[int] = 5
+    stage_version: ClassVar[int] = 6
 
     method: Literal[
         "mutual_ratio",

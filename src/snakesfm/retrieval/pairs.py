@@ -3,6 +3,7 @@
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -70,9 +71,14 @@ def exhaustive_pairs(count: int) -> PairTable:
     return PairTable.of(np.column_stack(np.triu_indices(count, 1)), "exhaustive")
 
 
+def natural_order(names: Sequence[str]) -> Array:
+    """Rows (N,) of the names in their natural order."""
+    return np.array(sorted(range(len(names)), key=lambda row: natural_key(names[row])), dtype=np.int64)
+
+
 def sequential_pairs(names: Sequence[str], look_ahead: int) -> PairTable:
     """Every image with the ``look_ahead`` images that follow it in the natural order of the names."""
-    order = np.array(sorted(range(len(names)), key=lambda row: natural_key(names[row])), dtype=np.int64)
+    order = natural_order(names)
     steps = range(1, min(look_ahead, len(names) - 1) + 1)
     pairs = [np.column_stack([order[:-step], order[step:]]) for step in steps]
     return PairTable.of(np.concatenate(pairs) if pairs else np.zeros((0, 2)), "sequential")
@@ -107,51 +113,84 @@ def similar_pairs(
     min_score: float,
     held_bytes: int = HELD_BYTES,
     threads: int = 1,
+    order: Array | None = None,
+    look_ahead: int = 0,
 ) -> PairTable:
-    """Every image with the ``top_k`` images that resemble it most.
+    """Every image with ``top_k`` images that resemble it, as :func:`choose_similar` chooses them.
 
-    The similarity matrix is computed block by block. Some blocks of descriptors are held while all blocks
-    pass by once, so that few are read again; beside them one block and its similarities are in memory, and
-    ``top_k`` candidates per image.
+    The similarity matrix is computed block by block. Some blocks of descriptors and the similarities of
+    their images to all others are held while all blocks pass by once, so that few are read again; beside
+    them one block is in memory.
 
     Parameters
     ----------
-    blocks : image rows (n_a,) of each block.
+    blocks : image rows (n_a,) of each block, which together are 0 .. N-1.
     read_block : gives the descriptors (n_a,D) float32 of a block, as ``round_units`` has them.
-    top_k : most partners that an image chooses; it may be chosen by more. Ties go to the smaller row.
+    top_k : most partners that an image chooses; it may be chosen by more.
     min_score : least similarity, as :func:`similarities_of` has it; -1 keeps all that are finite.
-    held_bytes : blocks are held until their descriptors take so much memory; at least one is.
+    held_bytes : blocks are held until they take so much memory; at least one is.
     threads : how many blocks of the matrix are computed at a time; changes nothing in the result.
+    order, look_ahead : as in :func:`choose_similar`.
     """
-    found: list[Array] = []
-    scores: list[Array] = []
+    found, scores = [np.zeros((0, 2), np.int64)], [np.zeros(0, np.float32)]
+    count = sum(map(len, blocks))
+    choose = partial(choose_similar, top_k=top_k, order=order, look_ahead=look_ahead)
     first = 0
     while first < len(blocks):
         held = {first: read_block(first)}
-        while first + len(held) < len(blocks) and sum(own.nbytes for own in held.values()) < held_bytes:
+        while (
+            first + len(held) < len(blocks)
+            and sum(own.nbytes + 4 * count * len(own) for own in held.values()) < held_bytes
+        ):
             held[first + len(held)] = read_block(first + len(held))
         first += len(held)
-        best = {
-            row: (np.full((len(own), 0), -1), np.zeros((len(own), 0), np.float32))
-            for row, own in held.items()
-        }
+        tables = {row: np.empty((len(own), count), np.float32) for row, own in held.items()}
         with ThreadPoolExecutor(threads) as pool:
-            for column in range(len(blocks)):
+            for column, columns in enumerate(blocks):
                 other = held[column] if column in held else read_block(column)
-                partners = (blocks[column], other, top_k)
-                tasks = {
-                    row: pool.submit(_widen, best[row], own, row == column, *partners)
-                    for row, own in held.items()
-                }
-                best = {row: task.result() for row, task in tasks.items()}
-        for row, (ids, similarities) in best.items():
-            # rounding lengthens descriptors: two that are opposite may give less than -1
-            kept = (similarities >= min_score) | (min_score == -1)
-            image, slot = np.nonzero(kept & np.isfinite(similarities))
-            found.append(np.column_stack([blocks[row][image], ids[image, slot]]))
-            scores.append(similarities[image, slot])
-    pairs = np.concatenate(found) if found else np.zeros((0, 2))
-    return PairTable.of(pairs, "retrieved", np.concatenate(scores) if scores else None)
+                tasks = [pool.submit(_fill, tables[row], columns, held[row], other) for row in held]
+                for task in tasks:
+                    task.result()
+            for row, table in tables.items():
+                table[np.arange(len(table)), blocks[row]] = -np.inf
+                # rounding lengthens descriptors: two that are opposite may give less than -1
+                if min_score > -1:
+                    table[table < min_score] = -np.inf
+                for image, line, partners in zip(
+                    blocks[row].tolist(), table, pool.map(choose, table), strict=True
+                ):
+                    found.append(np.column_stack([np.full(len(partners), image), partners]))
+                    scores.append(line[partners])
+    return PairTable.of(np.concatenate(found), "retrieved", np.concatenate(scores))
+
+
+def choose_similar(
+    similarities: Array, top_k: int, order: Array | None = None, look_ahead: int = 0
+) -> Array:
+    """The images (k,) most similar to one, at most ``top_k``; ties go to the smaller row.
+
+    In a slow video they are near copies of the same moment. So with an order half of them are chosen first
+    among those that are more similar than their neighbours in it: one of each moment, and of each other
+    time at the same place.
+
+    Parameters
+    ----------
+    similarities : (N,) of the image to all, -inf where one is never chosen.
+    order : (N,) images in the order of their names, or None where that tells nothing.
+    look_ahead : how many images before and behind an image in this order are its neighbours.
+    """
+    ranked = np.argsort(-similarities, kind="stable")
+    if order is not None:
+        # loaded here, as the other choices do without
+        from scipy.ndimage import maximum_filter1d
+
+        ordered = similarities[order]
+        peaks = np.zeros(len(order), bool)
+        peaks[order] = (ordered == maximum_filter1d(ordered, 2 * look_ahead + 1)) & (ordered > -np.inf)
+        rest = ranked[(top_k + 1) // 2 :]
+        ranked = np.concatenate([ranked[: (top_k + 1) // 2], rest[peaks[rest]], rest[~peaks[rest]]])
+    chosen = ranked[:top_k]
+    return chosen[similarities[chosen] > -np.inf]
 
 
 def similarities_of(own: Array, other: Array) -> Array:
@@ -166,21 +205,5 @@ def similarities_of(own: Array, other: Array) -> Array:
     return similarities
 
 
-def _widen(
-    best: tuple[Array, Array], own: Array, same: bool, more_ids: Array, other: Array, top_k: int
-) -> tuple[Array, Array]:
-    """The best partners of a block's images, of those found before and of one more block (or its own)."""
-    similarity = similarities_of(own, other)
-    if same:
-        np.fill_diagonal(similarity, -np.inf)
-    return _largest(*best, more_ids, similarity, top_k)
-
-
-def _largest(
-    ids: Array, similarities: Array, more_ids: Array, more: Array, top_k: int
-) -> tuple[Array, Array]:
-    """The ``top_k`` largest of each row and their ids, of those found before and of one more block."""
-    ids = np.concatenate([ids, np.broadcast_to(more_ids, more.shape)], axis=1)
-    both = np.concatenate([similarities, more], axis=1)
-    order = np.lexsort((ids, -both), axis=1)[:, :top_k]
-    return np.take_along_axis(ids, order, 1), np.take_along_axis(both, order, 1)
+def _fill(table: Array, columns: Array, own: Array, other: Array) -> None:
+    table[:, columns] = similarities_of(own, other)

@@ -12,7 +12,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 
 from snakesfm.arrays import Array
-from snakesfm.matching.nearest import augmented, pop_two_largest
+from snakesfm.matching.nearest import augmented, pop_two_largest, ratios_of
 
 FEWEST_KEYPOINTS = 50
 """Keypoints by which images with few of them are previewed."""
@@ -41,8 +41,7 @@ def likeness(first: Array, second: Array) -> float:
     nearest, best, runner_up = pop_two_largest(block)
     mutual = best == column_first[nearest]
     # rounding of float descriptors may lift the product of equal ones above zero
-    best, runner_up = np.minimum(best[mutual], 0), np.minimum(runner_up[mutual], 0)
-    ratios = np.sqrt(np.divide(best, runner_up, out=np.ones_like(best), where=runner_up < 0))
+    ratios = ratios_of(np.minimum(best[mutual], 0), np.minimum(runner_up[mutual], 0))
     return float(np.square(1 - ratios, dtype=np.float64).sum())
 
 
@@ -105,7 +104,8 @@ def choose_partners(pairs: Array, likenesses: Array, enough_partners: int, enoug
     less of the same, but from farther apart, and poses need both. An image whose partners are alike in
     little keeps more, as few matches have to be made up for by many pairs. Last come pairs that close a
     loop, whose images are more than ``LOOP_STEPS`` partners apart, a tenth of what is enough: in a long
-    sequence that comes back to where it was, neighbours in time are more alike.
+    sequence that comes back to where it was, neighbours in time are more alike. They are taken in rounds
+    until no such pair is left, as all near copies of a stop may prefer the same one of its neighbours.
 
     Parameters
     ----------
@@ -127,10 +127,11 @@ def choose_partners(pairs: Array, likenesses: Array, enough_partners: int, enoug
     sums -= sums[np.arange(len(order)) - places[order]]
     kept = (places[order] < enough_partners) | (sums < enough_likeness)
     stays[rows[order[kept]]] = True
-    left = np.flatnonzero(~stays)
-    closing = left[~_joined(pairs[left], pairs[stays])]
-    rows, _, ranks, _ = _ranked(pairs, likenesses, closing)
-    stays[rows[ranks < max(1, enough_partners // 10)]] = True
+    closing = np.flatnonzero(~stays)
+    while len(closing := closing[~_joined(pairs[closing], pairs[stays])]):
+        rows, _, ranks, _ = _ranked(pairs, likenesses, closing)
+        stays[rows[ranks < max(1, enough_partners // 10)]] = True
+        closing = closing[~stays[closing]]
     return stays
 
 

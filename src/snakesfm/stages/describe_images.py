@@ -8,6 +8,7 @@ import numpy as np
 from snakesfm.arrays import Array
 from snakesfm.artifacts.features import GlobalDescriptors, LocalFeatures, Vocabulary
 from snakesfm.artifacts.images import ImageIndex
+from snakesfm.geometry.orientations import show_pixels
 from snakesfm.learned.batches import in_batches
 from snakesfm.retrieval.codebook import largest_rows
 from snakesfm.retrieval.descriptor import DESCRIPTORS, describe_batch
@@ -67,7 +68,7 @@ def _describe_pictures(job: StageJob, options: "DescribeImagesOptions") -> tuple
             shorter = max(shorter, descriptor.smallest_side_px)
             pixels = images.read(image, shorter)
             if pixels is not None:
-                pictures[row] = pixels.rgb
+                pictures[row] = show_pixels(pixels.rgb, int(index.orientations[image]))
         described[list(pictures)] = describe_batch(descriptor, list(pictures.values()), side)
         progress.step(len(rows))
     if images.damaged:

@@ -3,6 +3,7 @@
 import hashlib
 import json
 from collections import Counter
+from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,7 +20,7 @@ from snakesfm.geometry.detector_pixels import (
     reduce_cameras,
     reduce_keypoints,
 )
-from snakesfm.grouping import offsets_of
+from snakesfm.grouping import join_parts
 from snakesfm.matching.overlays import cover_images, find_moving_matches
 from snakesfm.stages.job import StageJob
 from snakesfm.two_view.correspondences import first_rows_at_place, unify_matches
@@ -128,17 +129,7 @@ def _to_row(estimate: TwoViewEstimate) -> Row:
     }
 
 
-COLUMNS: dict[str, tuple[tuple[int, ...], str]] = {
-    "rotations": ((3, 3), "float64"),
-    "translations": ((3,), "float64"),
-    "covariances": ((5, 5), "float64"),
-    "kinds": ((), "int8"),
-    "rejections": ((), "int8"),
-    "match_counts": ((), "int32"),
-    "inlier_counts": ((), "int32"),
-    "inlier_ratios": ((), "float64"),
-    "triangulation_angles_deg": ((), "float64"),
-}
+COLUMNS = {column.name for column in fields(TwoViewGeometries)} - {"pairs", "digests", "offsets", "inliers"}
 
 
 def _read_former(path: Path, wanted: set[str]) -> dict[str, Row]:
@@ -157,18 +148,13 @@ def _read_former(path: Path, wanted: set[str]) -> dict[str, Row]:
 
 
 def _assemble(pairs: Array, rows: list[Row]) -> TwoViewGeometries:
-    columns = {
-        name: np.array([row[name] for row in rows], dtype=dtype).reshape(len(rows), *shape)
-        for name, (shape, dtype) in COLUMNS.items()
-    }
-    counts = [len(row["inliers"]) for row in rows]
-    inliers = [row["inliers"] for row in rows]
+    offsets, (inliers,) = join_parts([[row["inliers"]] for row in rows], [np.zeros((0, 2), np.int32)])
     return TwoViewGeometries(
         pairs=pairs,
         digests=np.array([row["digests"] for row in rows], dtype=object),
-        offsets=offsets_of(counts),
-        inliers=np.concatenate(inliers) if inliers else np.zeros((0, 2), dtype=np.int32),
-        **columns,
+        offsets=offsets,
+        inliers=inliers,
+        **{name: np.array([row[name] for row in rows]) for name in COLUMNS},
     )
 
 

@@ -21,6 +21,9 @@ from snakesfm.digests import file_digest, result_digest
 from snakesfm.errors import ConfigError
 from snakesfm.features.extraction import DETECTORS, extract_keypoints, sample_colors
 from snakesfm.features.keypoints import Detector, KeypointSet, KeypointSource
+from snakesfm.front_ends import LEARNED_DETECTORS
+from snakesfm.geometry.orientations import show_pixels
+from snakesfm.grouping import join_parts
 from snakesfm.hloc_files import FEATURES
 from snakesfm.ingest.discover import MASK_DIGESTS_NAME, fingerprint_images
 from snakesfm.ingest.indexed import IndexedImages
@@ -42,6 +45,7 @@ class ColoredKeypoints:
 
 
 REUSES_FORMER = True
+COLUMNS = ("keypoints", "descriptors", "scores", "scales", "angles")
 # the sides of a scaled image are whole pixels
 ASPECT_TOLERANCE = 0.01
 
@@ -80,12 +84,16 @@ def run(job: StageJob) -> None:
     progress.step(reused)
     missing = [place for place in range(len(rows)) if place not in results]
     sizes = [(width, height) for width, height in index.sizes[rows].tolist()]
-    for batch in in_batches([sizes[place] for place in missing], job.network_batch()):
+    # who does not know a picture that lies on its side sees images as they are shown
+    turned = options.method in LEARNED_DETECTORS or options.upright
+    turns = index.orientations[rows].tolist() if turned else [1] * len(rows)
+    for batch in in_batches([(sizes[place], turns[place]) for place in missing], job.network_batch()):
         places = [missing[part] for part in batch]
         images = [(names[place], sizes[place]) for place in places]
         wanted = [read_mask(masks[name], size) if name in masks else None for name, size in images]
         seen = [pictures.read(rows[place], options.max_shorter_side_px) for place in places]
-        results |= zip(places, _extract(images, seen, wanted, finder, options), strict=True)
+        found = _extract(images, seen, wanted, [turns[place] for place in places], finder, options)
+        results |= zip(places, found, strict=True)
         progress.step(len(places))
     ordered = [results[place] for place in range(len(rows))]
     _collect(index, rows, digests, ordered, finder).write(job.output, told.header)
@@ -217,12 +225,12 @@ def _extract(
     images: Sequence[tuple[str, tuple[int, int]]],
     pictures: Sequence[ImagePixels | None],
     masks: Sequence[Array | None],
+    turns: Sequence[int],
     finder: Detector | KeypointSource,
     options: "ExtractFeaturesOptions",
 ) -> list[ColoredKeypoints]:
-    """The keypoints of images, each given by its name, its width and height, its pixels and its mask."""
-    nothing = KeypointSet.empty(finder.descriptor_size, finder.descriptor_dtype)
-    results = [ColoredKeypoints(nothing, np.zeros((0, 3), np.uint8))] * len(images)
+    """The keypoints of images, each given by its name and size, pixels, mask and orientation (EXIF)."""
+    results = [_nothing(finder)] * len(images)
     pixels = {place: picture for place, picture in enumerate(pictures) if picture is not None}
     most = finder.usual_keypoints if options.max_keypoints == "auto" else options.max_keypoints
     if isinstance(finder, KeypointSource):
@@ -230,12 +238,17 @@ def _extract(
         if options.method == "virtual":
             found = [points.take(np.argsort(-points.scores, kind="stable")[:most]) for points in found]
     else:
-        seen = [(image.gray, image.rgb) for image in pixels.values()]
-        wanted = [masks[place] for place in pixels]
-        reduced = extract_keypoints(finder, seen, most, options.max_shorter_side_px, wanted)
+        seen = [
+            (show_pixels(image.gray, turns[place]), show_pixels(image.rgb, turns[place]))
+            for place, image in pixels.items()
+        ]
+        wanted = [
+            mask if (mask := masks[place]) is None else show_pixels(mask, turns[place]) for place in pixels
+        ]
+        shown = extract_keypoints(finder, seen, most, options.max_shorter_side_px, wanted)
         found = [
-            points.scaled(image.reduction, image.reduction)
-            for points, image in zip(reduced, pixels.values(), strict=True)
+            points.stored(turns[place]).scaled(image.reduction, image.reduction)
+            for points, (place, image) in zip(shown, pixels.items(), strict=True)
         ]
     for (place, image), gapped in zip(pixels.items(), found, strict=True):
         points = _without_gaps(gapped, images[place][0])
@@ -275,13 +288,7 @@ def _read_former(path: Path, wanted: set[str]) -> Mapping[str, ColoredKeypoints]
     for row, digest in enumerate(former.digests):
         if digest in wanted:
             part = slice(former.offsets[row], former.offsets[row + 1])
-            points = KeypointSet(
-                former.keypoints[part],
-                former.descriptors[part],
-                former.scores[part],
-                former.scales[part],
-                former.angles[part],
-            )
+            points = KeypointSet(*(getattr(former, column)[part] for column in COLUMNS))
             taken[str(digest)] = ColoredKeypoints(points, former.colors[part])
     return taken
 
@@ -293,20 +300,22 @@ def _collect(
     results: list[ColoredKeypoints],
     finder: Detector | KeypointSource,
 ) -> LocalFeatures:
-    # an empty set in front keeps shapes and dtypes where the block has no image
-    points = [KeypointSet.empty(finder.descriptor_size, finder.descriptor_dtype)]
-    points += [result.points for result in results]
-    colors = [np.zeros((0, 3), np.uint8), *(result.colors for result in results)]
+    nothing, *parts = (
+        [*(getattr(result.points, column) for column in COLUMNS), result.colors]
+        for result in (_nothing(finder), *results)
+    )
+    offsets, columns = join_parts(parts, nothing)
     return LocalFeatures(
         image_ids=rows,
         names=index.names[rows],
         sizes=index.sizes[rows],
         digests=np.array(digests, dtype=object),
-        offsets=np.cumsum([len(part) for part in points]),
-        keypoints=np.concatenate([part.keypoints for part in points]),
-        descriptors=np.concatenate([part.descriptors for part in points]),
-        scores=np.concatenate([part.scores for part in points]),
-        scales=np.concatenate([part.scales for part in points]),
-        angles=np.concatenate([part.angles for part in points]),
-        colors=np.concatenate(colors),
+        offsets=offsets,
+        **dict(zip((*COLUMNS, "colors"), columns, strict=True)),
     )
+
+
+def _nothing(finder: Detector | KeypointSource) -> ColoredKeypoints:
+    """What an image without keypoints has."""
+    points = KeypointSet.empty(finder.descriptor_size, finder.descriptor_dtype)
+    return ColoredKeypoints(points, np.zeros((0, 3), np.uint8))

@@ -8,7 +8,9 @@ import numpy as np
 from snakesfm.artifacts.features import LocalFeatures
 from snakesfm.artifacts.pairs import PairCoordinates, PairMatches
 from snakesfm.geometry.detector_pixels import detector_scales, reduce_keypoints
+from snakesfm.grouping import join_parts
 from snakesfm.matching.merging import MergedKeypoints, index_coordinates
+from snakesfm.matching.nearest import no_matches
 from snakesfm.stages.job import StageJob
 
 if TYPE_CHECKING:
@@ -20,8 +22,7 @@ def run(job: StageJob) -> None:
     options: IndexMatchesOptions = job.options
     tile = PairCoordinates.read(job.path("matches"))
     merged, digests, scales = _read_features(job)
-    # an empty pair in front keeps shapes and dtypes where the tile has no pair
-    matches, scores = [np.zeros((0, 2), np.int32)], [np.zeros(0, np.float32)]
+    parts = []
     for row, (i, j) in enumerate(tile.pairs.tolist()):
         part = slice(tile.offsets[row], tile.offsets[row + 1])
         coordinates = np.hstack(
@@ -30,11 +31,11 @@ def run(job: StageJob) -> None:
                 reduce_keypoints(tile.coordinates[part, 2:], scales[j]),
             ]
         )
-        found, sure = index_coordinates(
-            coordinates, tile.scores[part], merged[i], merged[j], options.max_distance_px
+        confidences = tile.scores[part]
+        parts.append(
+            index_coordinates(coordinates, confidences, merged[i], merged[j], options.max_distance_px)
         )
-        matches.append(found)
-        scores.append(sure)
+    offsets, (matches, scores) = join_parts(parts, no_matches())
     PairMatches(
         pairs=tile.pairs,
         digests=np.array(
@@ -44,13 +45,13 @@ def run(job: StageJob) -> None:
             ],
             object,
         ),
-        offsets=np.cumsum([len(part) for part in matches]),
-        matches=np.concatenate(matches),
-        scores=np.concatenate(scores),
+        offsets=offsets,
+        matches=matches,
+        scores=scores,
     ).write(job.output, job.header)
     print(
         f"{len(tile.pairs)} pairs, {len(tile.scores)} matches found, "
-        f"{sum(map(len, matches))} of them between different keypoints"
+        f"{len(matches)} of them between different keypoints"
     )
 
 

@@ -2,7 +2,7 @@
 
 import functools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
@@ -19,10 +19,12 @@ from snakesfm.digests import result_digest
 from snakesfm.features.keypoints import KeypointSet
 from snakesfm.front_ends import DETECTOR_FREE
 from snakesfm.geometry.detector_sides import LEAST_SIDE_PX
+from snakesfm.grouping import join_parts
 from snakesfm.hloc_files import MATCHES
 from snakesfm.learned.batches import cut
 from snakesfm.matching.detector_free import (
     DETECTOR_FREE_MATCHERS,
+    STRIP_IMAGES,
     DetectorFreeMatcher,
     Picture,
     no_coordinates,
@@ -62,23 +64,21 @@ def run(job: StageJob) -> None:
     if options.method == "virtual_places":
         beside += f" {job.seed}"
     with ExitStack() as stack:
-        source = ImageFiles(job) if free else FeatureFiles(job.paths("features"), stack)
+        source = ImageFiles(job) if free else FeatureFiles(job, stack)
         digests = [
             result_digest(options, beside, source.digests[i], source.digests[j]) for i, j in pairs.tolist()
         ]
         results = job.take_over(digests, functools.partial(_read_former, kind))
         reused = len(results)
         progress = job.progress(len(pairs) - reused, "pairs")
+        # all second images pass by so many first ones, of which each is prepared once
+        width = STRIP_IMAGES if free else 1
+        read_first = functools.lru_cache(width)(lambda i: matcher.prepare(source.read(i)))
         read_second = functools.lru_cache(HELD_IMAGES)(lambda j: matcher.prepare_second(source.read(j)))
-        held, first = -1, None
-        # pairs are sorted, so that each first image is prepared once
-        missing = [row for row in range(len(pairs)) if row not in results]
+        strips = np.unique(pairs[:, 0], return_inverse=True)[1] // width
+        missing = [row for row in np.lexsort((*pairs.T, strips)).tolist() if row not in results]
         for rows in cut(missing, job.network_batch()):
-            prepared = []
-            for i, j in pairs[rows].tolist():
-                if i != held:
-                    held, first = i, matcher.prepare(source.read(i))
-                prepared.append((first, read_second(j)))
+            prepared = [(read_first(i), read_second(j)) for i, j in pairs[rows].tolist()]
             results |= zip(rows, _match(matcher, prepared), strict=True)
             progress.step(len(rows))
     if isinstance(source, ImageFiles) and source.images.damaged:
@@ -163,14 +163,16 @@ class FeatureFiles:
 
     Parameters
     ----------
-    paths : files of LocalFeatures.
+    job : with the files, and the index where a network matches keypoints: it knows images as shown.
     stack : closes the files.
     """
 
-    def __init__(self, paths: Sequence[Path], stack: ExitStack) -> None:
+    def __init__(self, job: StageJob, stack: ExitStack) -> None:
         self.digests: dict[int, str] = {}
         self._places: dict[int, tuple[list[Any], slice, tuple[int, int], str]] = {}
-        for path in paths:
+        index = [ImageIndex.read(path) for path in job.paths("index")]
+        self._orientations = index[0].orientations.tolist() if index else None
+        for path in job.paths("features"):
             file = stack.enter_context(LocalFeatures.open(path))
             offsets = file["offsets"][()].tolist()
             digests, names = file["digests"].asstr()[()], file["names"].asstr()[()]
@@ -186,7 +188,8 @@ class FeatureFiles:
         """The features of one image of the index."""
         columns, part, size, name = self._places[image]
         points = KeypointSet(*(column[part] for column in columns))
-        return replace(points, image_size=size, image_name=name)
+        points = replace(points, image_size=size, image_name=name)
+        return points if self._orientations is None else points.shown(self._orientations[image])
 
 
 class ImageFiles:
@@ -208,21 +211,21 @@ class ImageFiles:
             # the oracle knows an image by its name
             self.digests = [" ".join(both) for both in zip(self.digests, self._names, strict=True)]
         self._sizes = [(width, height) for width, height in index.sizes.tolist()]
+        self._orientations = index.orientations.tolist()
         self._side_px = int(job.options.longer_side_px)
 
     def read(self, image: int) -> Picture:
         """One image of the index, not smaller than the matcher wants it."""
-        name, size = self._names[image], self._sizes[image]
+        name, size, orientation = self._names[image], self._sizes[image], self._orientations[image]
         shorter = max(math.ceil(self._side_px * min(size) / max(size)), LEAST_SIDE_PX)
         pixels = self.images.read(image, shorter)
         if pixels is None:
             black = np.zeros((size[1], size[0], 3), np.uint8)
             return Picture(name, size, black[..., 0], black)
         # the last column and row may go beyond the original image
-        seen = (size[0] / pixels.reduction, size[1] / pixels.reduction)
-        width, height = (max(1, int(side)) for side in seen)
-        shown = (width * pixels.reduction, height * pixels.reduction)
-        return Picture(name, shown, pixels.gray[:height, :width], pixels.rgb[:height, :width])
+        width, height = (max(1, side // pixels.reduction) for side in size)
+        gray, rgb = pixels.gray[:height, :width], pixels.rgb[:height, :width]
+        return Picture(name, size, gray, rgb, pixels.reduction, orientation)
 
 
 def _read_former(
@@ -244,14 +247,12 @@ def _read_former(
 def _collect(
     kind: type[PairMatches | PairCoordinates], pairs: Array, digests: list[str], results: list[Matches]
 ) -> PairMatches | PairCoordinates:
-    # an empty pair in front keeps shapes and dtypes where the tile has no pair
     free = kind is PairCoordinates
-    nothing = no_coordinates() if free else no_matches()
-    matches, scores = ([nothing[part], *(result[part] for result in results)] for part in (0, 1))
+    offsets, (matches, scores) = join_parts(results, no_coordinates() if free else no_matches())
     return kind(
         pairs=pairs,
         digests=np.array(digests, dtype=object),
-        offsets=np.cumsum([len(part) for part in matches]),
-        **{"coordinates" if free else "matches": np.concatenate(matches)},
-        scores=np.concatenate(scores),
+        offsets=offsets,
+        **{"coordinates" if free else "matches": matches},
+        scores=scores,
     )

@@ -14,12 +14,16 @@ from snakesfm.artifacts.pairs import PairCoordinates
 from snakesfm.features.extraction import sample_colors
 from snakesfm.geometry.detector_pixels import detector_scales, reduce_keypoints
 from snakesfm.geometry.detector_sides import USUAL_SIDE_PX
+from snakesfm.grouping import join_parts
 from snakesfm.ingest.indexed import IndexedImages
 from snakesfm.matching.merging import merge_coordinates
 from snakesfm.stages.job import StageJob
 
 if TYPE_CHECKING:
     from snakesfm.config.merge_keypoints import MergeKeypointsOptions
+
+# places and scores
+NOTHING = (np.zeros((0, 2), np.float32), np.zeros(0, np.float32))
 
 
 def run(job: StageJob) -> None:
@@ -37,31 +41,28 @@ def run(job: StageJob) -> None:
     found = _gather(job.paths("matches"), set(rows.tolist()))
     images = IndexedImages(index.names, index.sha256, job.settings["images"])
     progress = job.progress(len(rows), "images")
-    # an empty set in front keeps shapes and dtypes where the block has no image
-    keypoints, scores = [np.zeros((0, 2), np.float32)], [np.zeros(0, np.float32)]
-    colors = [np.zeros((0, 3), np.uint8)]
+    parts = []
     scales = detector_scales(index.sizes[rows], job.settings).tolist()
     for row, scale in zip(rows.tolist(), scales, strict=True):
         places, confidences = found[row]
         merged, sure = merge_coordinates(reduce_keypoints(places, scale), confidences, options.radius_px)
         merged = reduce_keypoints(merged, 1.0 / scale)
-        keypoints.append(merged)
-        scores.append(sure)
-        colors.append(_read_colors(images, row, merged))
+        parts.append((merged, sure, _read_colors(images, row, merged)))
         progress.step()
-    count = sum(map(len, keypoints))
+    offsets, (keypoints, scores, colors) = join_parts(parts, (*NOTHING, np.zeros((0, 3), np.uint8)))
+    count = len(keypoints)
     LocalFeatures(
         image_ids=rows,
         names=index.names[rows],
         sizes=index.sizes[rows],
-        digests=np.array([hashlib.sha256(part.tobytes()).hexdigest() for part in keypoints[1:]], object),
-        offsets=np.cumsum([len(part) for part in keypoints]),
-        keypoints=np.concatenate(keypoints),
+        digests=np.array([hashlib.sha256(part[0].tobytes()).hexdigest() for part in parts], object),
+        offsets=offsets,
+        keypoints=keypoints,
         descriptors=np.zeros((count, 0), np.uint8),
-        scores=np.concatenate(scores),
+        scores=scores,
         scales=np.ones(count, np.float32),
         angles=np.zeros(count, np.float32),
-        colors=np.concatenate(colors),
+        colors=colors,
     ).write(job.output, job.header)
     before = sum(len(places) for places, _ in found.values())
     print(f"{len(rows)} images, {before} matched positions merged into {count} keypoints")
@@ -78,11 +79,7 @@ def _gather(paths: list[Path], images: set[int]) -> Mapping[int, tuple[Array, Ar
                 if image in images:
                     places = tile.coordinates[part, 2 * side : 2 * side + 2]
                     parts[image].append((places, tile.scores[part]))
-    nothing = (np.zeros((0, 2), np.float32), np.zeros(0, np.float32))
-    return {
-        image: tuple(np.concatenate(column) for column in zip(nothing, *some, strict=True))  # type: ignore[misc]
-        for image, some in parts.items()
-    }
+    return {image: tuple(join_parts(some, NOTHING)[1]) for image, some in parts.items()}  # type: ignore[misc]
 
 
 def _read_colors(images: IndexedImages, row: int, keypoints: Array) -> Array:

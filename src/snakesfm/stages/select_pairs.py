@@ -2,6 +2,7 @@
 
 import itertools
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -19,6 +20,7 @@ from snakesfm.retrieval.listed import listed_pairs
 from snakesfm.retrieval.pairs import (
     PairTable,
     exhaustive_pairs,
+    natural_order,
     sequential_pairs,
     similar_pairs,
     spatial_pairs,
@@ -42,10 +44,7 @@ def run(job: StageJob) -> None:
     index = ImageIndex.read(job.path("index"))
     pairs_file = str(job.settings["pairs_file"])
     options: SelectPairsOptions = job.options
-    table = _choose(job, index, options, pairs_file)
-    if options.method != "listed":
-        # the first of several images with the same bytes stands for all
-        table = table.take(np.flatnonzero((index.duplicate_of[table.pairs] < 0).all(axis=1)))
+    table = _follow_list(job, index, pairs_file) if options.method == "listed" else _propose(job, index)
     proposed = len(table.pairs)
     likenesses = np.full(proposed, np.nan, np.float32)
     if options.preview_keypoints:
@@ -106,19 +105,25 @@ def read_previews(paths: list[Path], images: int, count: int) -> list[Array]:
     return previews
 
 
-def _choose(job: StageJob, index: ImageIndex, options: "SelectPairsOptions", pairs_file: str) -> PairTable:
+def _follow_list(job: StageJob, index: ImageIndex, pairs_file: str) -> PairTable:
     names = [str(name) for name in index.names]
-    if options.method == "listed":
-        if is_matches_file(pairs_file):
-            return _matched_pairs(job, pairs_file, names)
-        return _read_list(job, pairs_file, names, [str(name) for name in index.refused_names])
-    if options.method == "exhaustive":
-        return exhaustive_pairs(len(names))
+    if is_matches_file(pairs_file):
+        return _matched_pairs(job, pairs_file, names)
+    return _read_list(job, pairs_file, names, [str(name) for name in index.refused_names])
+
+
+def _propose(job: StageJob, index: ImageIndex) -> PairTable:
+    """The method's pairs, among images of which the first of several with the same bytes stands for all."""
+    options: SelectPairsOptions = job.options
+    rows = np.flatnonzero(index.duplicate_of < 0)
+    names = [str(name) for name in index.names[rows]]
     table = PairTable.of(np.zeros((0, 2)), "sequential")
+    if options.method == "exhaustive":
+        table = exhaustive_pairs(len(names))
     if "sequential" in options.method:
         table = table.union(sequential_pairs(names, options.look_ahead))
     if "spatial" in options.method:
-        places = _local_places(index)
+        places = _local_places(index.gps[rows])
         table = table.union(spatial_pairs(places, int(options.top_k)))
         unplaced = ~np.isfinite(places[:, 0])
         if unplaced.any():
@@ -131,16 +136,17 @@ def _choose(job: StageJob, index: ImageIndex, options: "SelectPairsOptions", pai
             by_name = sequential_pairs(names, math.ceil(int(options.top_k) / 2))
             table = table.union(by_name.take(np.flatnonzero(unplaced[by_name.pairs].any(axis=1))))
     if "retrieval" in options.method:
-        table = table.union(_retrieve(job.paths("descriptors"), options, job.threads))
-    return table
+        order = natural_order(names) if "sequential" in options.method else None
+        table = table.union(_retrieve(job, rows, order))
+    return replace(table, pairs=rows[table.pairs])
 
 
-def _local_places(index: ImageIndex) -> Array:
-    """Metres east and north (N,2) of the images, NaN where EXIF does not tell.
+def _local_places(gps: Array) -> Array:
+    """Metres east and north (N,2) of images with GPS (N,3), NaN where EXIF does not tell.
 
     Height is left out: EXIF often has it from another zero, or not at all.
     """
-    places = np.column_stack([index.gps[:, :2], np.zeros(len(index.gps))])
+    places = np.column_stack([gps[:, :2], np.zeros(len(gps))])
     origin = local_origin(places)
     if origin is None:
         raise ConfigError(
@@ -182,15 +188,21 @@ def _matched_pairs(job: StageJob, path: str, names: list[str]) -> PairTable:
     return PairTable.of(pairs, "listed")
 
 
-def _retrieve(paths: list[Path], options: "SelectPairsOptions", threads: int) -> PairTable:
-    image_ids = []
+def _retrieve(job: StageJob, rows: Array, order: Array | None) -> PairTable:
+    """Similar ones of some rows of the index, as places in ``rows``, which ``order`` sorts by name."""
+    options: SelectPairsOptions = job.options
+    paths, kept, places = job.paths("descriptors"), [], []
     for path in paths:
         with GlobalDescriptors.open(path) as file:
-            image_ids.append(file["image_ids"][()])
+            image_ids = file["image_ids"][()]
+        kept.append(np.isin(image_ids, rows))
+        places.append(np.searchsorted(rows, image_ids[kept[-1]]))
     return similar_pairs(
-        image_ids,
-        lambda block: GlobalDescriptors.read(paths[block]).descriptors,
+        places,
+        lambda block: GlobalDescriptors.read(paths[block]).descriptors[kept[block]],
         int(options.top_k),
         options.min_score,
-        threads=threads,
+        threads=job.threads,
+        order=order,
+        look_ahead=options.look_ahead,
     )

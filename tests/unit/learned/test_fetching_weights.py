@@ -2,7 +2,9 @@
 
 import hashlib
 import importlib.metadata
+import threading
 import zipfile
+from http.server import BaseHTTPRequestHandler, HTTPServer
 
 import pytest
 
@@ -63,11 +65,35 @@ def test_without_a_known_sum_the_first_download_counts(monkeypatch, source, fold
     fetch_weights(["net"], folder)
     source.write_bytes(b"another")
     (folder / "net.bin").write_bytes(b"damaged")
-    with pytest.raises(ConfigError, match="replaced at its source"):
+    with pytest.raises(ConfigError, match=r"first download.*SHA256SUMS.*replaced at its source"):
         fetch_weights(["net"], folder)
     source.write_bytes(CONTENT)
     fetch_weights(["net"], folder)
     assert sha256_of(folder / "net.bin") == SUM
+
+
+@pytest.mark.parametrize("header", [("Content-Length", "9000"), ("Transfer-Encoding", "chunked")])
+def test_a_download_that_breaks_off_is_refused_and_leaves_nothing(monkeypatch, folder, header):
+    class Server(BaseHTTPRequestHandler):
+        protocol_version = "HTTP/1.1"
+
+        def do_GET(self):
+            self.send_response(200)
+            self.send_header(*header)
+            self.end_headers()
+            # a chunk of 9,000 bytes, of which 7,000 come
+            self.wfile.write((b"" if header[0] == "Content-Length" else b"2328\r\n") + CONTENT)
+            self.close_connection = True
+
+        def log_message(self, *_):
+            pass
+
+    with HTTPServer(("127.0.0.1", 0), Server) as server:
+        threading.Thread(target=server.handle_request, daemon=True).start()
+        declare(monkeypatch, url=f"http://127.0.0.1:{server.server_port}/net.bin")
+        with pytest.raises(ConfigError, match="cannot be downloaded"):
+            fetch_weights(["net"], folder)
+    assert not list(folder.iterdir())
 
 
 def test_a_file_comes_out_of_an_installed_package(monkeypatch, folder):

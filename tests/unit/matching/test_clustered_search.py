@@ -48,6 +48,17 @@ def test_finds_nearly_all_that_exact_search_finds_and_little_else():
     assert wrong < 1.4 * exact_wrong + 10
 
 
+@pytest.mark.parametrize("words", [1, 16])
+def test_what_is_there_twice_is_no_ones_nearest(words):
+    first, second, _ = scene(3)
+    second = np.concatenate([first[:3], first[:2], second])
+    search = ClusteredSearch.build(first, words, 16)
+    alone = search.match(second, RATIO)[0]
+    assert not np.isin(alone[:, 0], [0, 1]).any() and [2, 2] in alone.tolist()
+    # without the test the first one counts
+    assert search.match(second, 1.0)[0][:3].tolist() == [[0, 0], [1, 1], [2, 2]]
+
+
 def test_more_probes_find_more():
     first, second, _ = scene(7)
     exact = as_set(exact_search(first).match(second, RATIO)[0])
@@ -135,7 +146,7 @@ def test_no_second_nearest_no_match():
     second = np.concatenate([first[:1], first[900:]])
     matches, _ = search.match(second, 1.0)
     assert 0 not in matches[:, 0] and len(matches) == 380
-    assert len(search.match(second[:1].repeat(2, axis=0), RATIO)[0]) == 1
+    assert search.match(first[:2], RATIO)[0].tolist() == [[0, 0], [1, 1]]
 
 
 def test_codebook_of_integers_is_of_integers_and_of_floats_is_not():

@@ -7,7 +7,7 @@ from snakesfm.config.select_pairs import SelectPairsOptions
 from snakesfm.errors import ConfigError
 from snakesfm.image_names import natural_key
 from snakesfm.retrieval.listed import listed_pairs
-from snakesfm.retrieval.pairs import PairTable, sequential_pairs, similar_pairs
+from snakesfm.retrieval.pairs import PairTable, choose_similar, sequential_pairs, similar_pairs
 from snakesfm.retrieval.rounding import round_units
 
 
@@ -83,7 +83,7 @@ def test_blocks_that_are_held_are_not_read_again_and_change_nothing():
     blocks = [np.arange(start, start + 8) for start in range(0, 40, 8)]
     counts, tables = [], []
     # one block at a time, two, and all
-    for held_bytes in (0, 2 * vectors[:8].nbytes, 1 << 30):
+    for held_bytes in (0, 2 * (vectors[:8].nbytes + 8 * 40 * 4), 1 << 30):
         reads = []
 
         def read(block, reads=reads):
@@ -96,6 +96,60 @@ def test_blocks_that_are_held_are_not_read_again_and_change_nothing():
     for table in tables[1:]:
         np.testing.assert_array_equal(table.pairs, tables[0].pairs)
         np.testing.assert_array_equal(table.similarities, tables[0].similarities)
+
+
+def ring_vectors(count, lap, seed=0):
+    """Descriptors of a slow video that goes round in laps: what is like by place, and more so by time."""
+    rng = np.random.default_rng(seed)
+    time = np.arange(count)[:, None] / 80.0
+    place = 2 * np.pi * np.arange(count)[:, None] / lap
+    ring = np.hstack([np.cos(place), np.sin(place)]) * lap / (2 * np.pi * 80.0)
+    parts = []
+    for where, share in ((ring, 0.6), (time, 0.4)):
+        # random features of a Gaussian kernel of 80 images (Rahimi and Recht 2007)
+        waves = where @ rng.normal(size=(where.shape[1], 1000)) + rng.uniform(0, 2 * np.pi, 1000)
+        parts.append(np.cos(waves) * np.sqrt(share))
+    vectors = np.hstack(parts) + rng.normal(size=(count, 2000)) * 0.1
+    return round_units(vectors / np.linalg.norm(vectors, axis=1, keepdims=True))
+
+
+def test_the_second_lap_of_a_slow_video_is_found():
+    count, lap = 1200, 600
+    times = np.random.default_rng(1).permutation(count)
+    vectors = ring_vectors(count, lap)[times]
+    blocks = np.array_split(np.arange(count), 4)
+
+    def find(**told):
+        table = similar_pairs(blocks, lambda block: vectors[blocks[block]], 100, -1.0, **told)
+        pairs = np.sort(times[table.pairs], axis=1)
+        return pairs, np.abs(pairs[:, 1] - pairs[:, 0] - lap) <= 15
+
+    # the first and last images of the video have fewer neighbours
+    middle = np.arange(100, lap - 100)
+    alone, closing = find()
+    assert not np.isin(middle, alone[closing]).any()
+    pairs, closing = find(order=np.argsort(times), look_ahead=10)
+    assert np.isin(middle, pairs[closing, 0]).mean() > 0.95
+    assert len(pairs) < 100 * count
+    near = [set(map(tuple, some[some[:, 1] - some[:, 0] < 20].tolist())) for some in (alone, pairs)]
+    # as the most similar ones were
+    assert near[0] == near[1] and len(near[0]) > 18 * count
+
+
+def test_in_an_order_half_of_the_images_are_larger_than_their_neighbours():
+    similarities = np.array([9, 8, 7, 6, -np.inf, 1, 2, 0, 3, -np.inf, -np.inf, -np.inf, 4, 0], np.float32)
+    order = np.arange(len(similarities))
+
+    def chosen(top_k, look_ahead, order=order):
+        return choose_similar(similarities, top_k, order, look_ahead).tolist()
+
+    assert chosen(6, 1, None) == [0, 1, 2, 3, 12, 8]
+    # the largest of 11 .. 13 and of 7 .. 9 and of 5 .. 7
+    assert chosen(6, 1) == [0, 1, 2, 12, 8, 6] and chosen(5, 2) == [0, 1, 2, 12, 8]
+    assert chosen(7, 2) == [0, 1, 2, 3, 12, 8, 6]
+    # where there are no more of them the next most similar fill up, and who is never chosen does not
+    assert chosen(8, 1) == [0, 1, 2, 3, 12, 8, 6, 5] and len(chosen(14, 1)) == 10
+    assert chosen(2, 1) == [0, 12] and chosen(1, 1) == [0]
 
 
 def test_images_without_features_resemble_none():

@@ -7,6 +7,7 @@ import pytest
 
 from snakesfm.features.keypoints import KeypointSet
 from snakesfm.features.sift import rootsift
+from snakesfm.grouping import components_of
 from snakesfm.retrieval.preview import (
     alike_pairs,
     choose_partners,
@@ -118,6 +119,16 @@ def partners_by_hand(pairs, likenesses, enough_partners, enough_likeness):
             if place < enough_partners or total < enough_likeness:
                 stays.add(row)
             total += likenesses[row]
+    while apart := rows_apart(pairs, stays):
+        for image in np.unique(pairs):
+            own = [row for row in apart if image in pairs[row]]
+            own.sort(key=lambda row: (-likenesses[row], pairs[row].sum() - image))
+            stays.update(own[: max(1, enough_partners // 10)])
+    return sorted(stays)
+
+
+def rows_apart(pairs, stays):
+    """The pairs whose images are more than four of those that stay apart."""
     joined = {image: {image} for image in pairs.ravel().tolist()}
     for _ in range(4):
         joined = {
@@ -126,14 +137,9 @@ def partners_by_hand(pairs, likenesses, enough_partners, enough_likeness):
             )
             for image, near in joined.items()
         }
-    apart = [
+    return [
         row for row in range(len(pairs)) if row not in stays and pairs[row][1] not in joined[pairs[row][0]]
     ]
-    for image in np.unique(pairs):
-        own = [row for row in apart if image in pairs[row]]
-        own.sort(key=lambda row: (-likenesses[row], pairs[row].sum() - image))
-        stays.update(own[: max(1, enough_partners // 10)])
-    return sorted(stays)
 
 
 @pytest.mark.parametrize(
@@ -191,6 +197,20 @@ def test_a_loop_is_closed_though_neighbours_in_time_are_more_alike():
     assert stays[closing].all() and closing.sum() == count // 2
     assert stays[apart == 1].all() and not stays[apart == reach].any()
     assert 0.5 * enough * count < stays[~closing].sum() < enough * count
+
+
+def test_stops_of_near_copies_stay_tied_together():
+    """Each of eight stops resembles the two beside it, but all its images prefer the same one of these."""
+    stops, copies = 8, 60
+    count = stops * copies
+    pairs = np.column_stack(np.triu_indices(count, 1))
+    first, second = (pairs // copies).T
+    likenesses = np.select([first == second, second - first > 1, first % 2 == 0], [90.0, 0.0, 20.0], 5.0)
+    pairs, likenesses = pairs[likenesses > 0], likenesses[likenesses > 0]
+    stays = choose_partners(pairs, likenesses.astype(np.float32), 30, 250.0)
+    assert not components_of(count, pairs[stays]).any()
+    # few more than thirty partners, and three for each of the stops beside
+    assert stays.sum() < 38 * count
 
 
 def test_no_pairs_are_no_partners():

@@ -9,13 +9,15 @@ import numpy as np
 import pytest
 from image_stages import NAMES, SHIFT, Scene
 
-from snakesfm.artifacts import GlobalDescriptors, LocalFeatures, Vocabulary
+from snakesfm.artifacts import GlobalDescriptors, Header, LocalFeatures, Vocabulary
+from snakesfm.blocks import deal_blocks
 from snakesfm.config.extract_features import ExtractFeaturesOptions
 from snakesfm.config.match_pairs import MatchPairsOptions
 from snakesfm.config.select_pairs import SelectPairsOptions
 from snakesfm.errors import ConfigError
 from snakesfm.ingest.indexed import IndexedImages
 from snakesfm.matching.matcher import MutualRatioMatcher
+from snakesfm.retrieval.rounding import round_units
 from snakesfm.stages import match_pairs
 
 
@@ -69,6 +71,26 @@ def test_retrieval_prefers_what_overlaps(dealt):
     assert all(0 < similarity <= 1.001 for _, _, similarity, _ in rows)
     vectors = GlobalDescriptors.read(dealt.block_files("descriptors")[0]).descriptors
     assert vectors.shape[1] == 8 * 128
+
+
+def test_a_sequence_is_searched_for_similar_images_of_other_times(tmp_path, images):
+    scene = Scene(tmp_path, images, 2)
+    # the second and third image are nearly the first one, the last one shows the same place again
+    angles = np.radians([0, 4, 8, 40, 60, 20])
+    vectors = round_units(np.column_stack([np.cos(angles), np.sin(angles)]))
+    dealt = np.array(deal_blocks(NAMES, 2))
+    for block, path in enumerate(scene.block_files("descriptors")):
+        rows = np.flatnonzero(dealt == block)
+        descriptors = GlobalDescriptors(image_ids=rows, descriptors=vectors[rows])
+        descriptors.write(path, Header("describe_images", 1, "scene"))
+
+    def retrieved(method):
+        options = SelectPairsOptions(method=method, look_ahead=1, top_k=2, preview_keypoints=0)
+        return {pair for pair, reason, *_ in scene.select(options) if "retrieved" in reason}
+
+    assert {(0, 1), (0, 5)} <= retrieved("sequential+retrieval")
+    # without an order of names the most similar ones are all that counts
+    assert (0, 2) in retrieved("retrieval") and (0, 5) not in retrieved("retrieval")
 
 
 def test_auto_takes_all_pairs_of_few_images(dealt):

@@ -1,15 +1,18 @@
 """Stages merge_keypoints and index_matches on places that were matched without keypoints."""
 
+import functools
+
 import cv2
 import numpy as np
 import pytest
 from plain_artifacts import write_plain_index
 
 from snakesfm.artifacts import Header, LocalFeatures, PairMatches
-from snakesfm.artifacts.pairs import PairCoordinates
+from snakesfm.artifacts.pairs import ImagePairs, PairCoordinates
 from snakesfm.config.index_matches import IndexMatchesOptions
 from snakesfm.config.match_pairs import MatchPairsOptions
 from snakesfm.config.merge_keypoints import MergeKeypointsOptions
+from snakesfm.matching.loftr import HELD_FEATURES
 from snakesfm.stages import index_matches, match_pairs, merge_keypoints
 from snakesfm.stages.job import StageJob
 
@@ -76,7 +79,42 @@ def test_a_matcher_gets_images_large_enough(tmp_path, size, side, least):
     found = match_pairs.ImageFiles(job).read(0)
     # decoded at the smallest fraction that is not too small
     assert least <= min(found.gray.shape) < 2.1 * least
-    assert min(found.size) == pytest.approx(height, abs=8)
+    assert found.size == size
+    # what the pixels show of it, which ends at a whole pixel
+    shown = np.array(found.gray.shape[::-1]) * found.reduction
+    assert (shown <= size).all() and (shown > np.array(size) - found.reduction).all()
+
+
+def test_few_images_are_seen_anew_in_a_tile(tmp_path, monkeypatch):
+    """Of a matcher that holds what it sees of a few images, as LoFTR does."""
+    count = 20
+    pixels = np.random.default_rng(0).integers(0, 255, (64, 64), dtype=np.uint8)
+    for k in range(count):
+        cv2.imwrite(str(tmp_path / f"{k}.jpg"), pixels)
+    write_index(tmp_path, [(64, 64)] * count)
+    pairs = np.column_stack(np.triu_indices(count, 1))
+    some = np.zeros(len(pairs))
+    ImagePairs(pairs, [""] * len(pairs), some, some).write(tmp_path / "pairs.h5", HEADER)
+    see = functools.lru_cache(HELD_FEATURES)(lambda image: image)
+    matched = []
+
+    class Matcher:
+        prepare = prepare_second = staticmethod(lambda picture: int(picture.name[:-4]))
+
+        def match(self, first, second):
+            matched.append((see(first), see(second)))
+            return np.full((1, 4), first, np.float32), np.full(1, second / count, np.float32)
+
+    monkeypatch.setattr(match_pairs, "_create_detector_free", lambda *_: Matcher())
+    inputs = {"index": tmp_path / "index.h5", "pairs": tmp_path / "pairs.h5"}
+    options, output = MatchPairsOptions(method="loftr"), tmp_path / "matches.h5"
+    match_pairs.run(StageJob("match_pairs", "scene", inputs, (output,), options, {"images": str(tmp_path)}))
+    assert len(matched) == len(set(matched)) == len(pairs)
+    # a strip's own images and all behind them
+    assert see.cache_info().misses <= 20 + 14 + 8 + 2
+    found = PairCoordinates.read(output)
+    np.testing.assert_array_equal(found.coordinates[:, 0], pairs[:, 0])
+    np.testing.assert_allclose(found.scores * count, pairs[:, 1], rtol=1e-5)
 
 
 def test_places_in_larger_photographs_are_merged_as_far_as_the_matcher_saw_them(run):

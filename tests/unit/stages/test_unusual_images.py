@@ -55,6 +55,12 @@ def test_copies_of_an_image_are_left_out_but_where_a_list_names_them(images, tmp
     options = SelectPairsOptions(preview_keypoints=0, method="exhaustive")
     pairs = {pair for pair, *_ in scene.select(options)}
     assert pairs == {(i, j) for i in range(6) for j in range(i + 1, 6) if not {1, 5} & {i, j}}
+    # a copy takes no place among the neighbours
+    scene.describe()
+    for changes in ({"method": "sequential", "look_ahead": 1}, {"method": "retrieval", "top_k": 1}):
+        pairs = {pair for pair, *_ in scene.select(options.model_copy(update=changes))}
+        assert (0, 2) in pairs if "look_ahead" in changes else {0, 4} <= set(sum(pairs, ()))
+        assert not {1, 5} & set(sum(pairs, ()))
     path = tmp_path / "pairs.txt"
     path.write_text(f"{NAMES[0]} {NAMES[1]}\n", "utf-8")
     assert [pair for pair, *_ in scene.select(SelectPairsOptions(method="listed"), str(path))] == [(0, 1)]
