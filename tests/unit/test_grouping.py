@@ -3,13 +3,20 @@
 import numpy as np
 import pytest
 
-from snakesfm.grouping import components_of, offsets_of, one_to_one, sum_by
+from snakesfm.grouping import components_of, offsets_of, one_to_one, starts_of, sum_by
 
 
 def test_offsets_begin_at_zero_and_are_wide_integers() -> None:
     assert offsets_of([3, 0, 2]).tolist() == [0, 3, 3, 5]
     for few in ([], np.zeros(0), np.array([2**31 - 1, 1], np.int32), np.array([200, 100], np.uint8)):
         assert offsets_of(few).dtype == np.int64 and offsets_of(few)[-1] == sum(map(int, few))
+
+
+def test_runs_start_where_any_column_changes() -> None:
+    first, second = np.array([1, 1, 2, 2, 2]), np.array([7, 7, 7, 0, 0])
+    assert starts_of(first, second).tolist() == [True, False, True, True, False]
+    assert starts_of(first).tolist() == [True, False, True, False, False]
+    assert starts_of(first[:0]).tolist() == []
 
 
 @pytest.mark.parametrize("shape", [(), (3,), (3, 3)])

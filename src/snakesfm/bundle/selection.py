@@ -14,6 +14,9 @@ from snakesfm.geometry.colmap_binding import pycolmap
 from snakesfm.geometry.colmap_writing import keypoints_of_observations
 from snakesfm.grouping import offsets_of
 
+# images that see a point, twice what is usual
+LONG_TRACK = 10
+
 
 def select_points(point_rows: Array, images: Array, count: int, per_image: int, seed: int) -> Array:
     """Points that are among the first ``per_image`` of any image, those seen by most images first.
@@ -138,8 +141,16 @@ def with_points(
 def with_some_points(
     reconstruction: pycolmap.Reconstruction, most: int, split: Container[int] = ()
 ) -> pycolmap.Reconstruction:
-    """The same with at most so many points, spread over all: enough to try a few numbers on."""
+    """The same with at most so many points, spread over all: enough to try a few numbers on.
+
+    Where these are seen by so many images that they cost more than as many usual ones, fewer that leave
+    each image about as many observations as any other.
+    """
     tracks, pixels = read_tracks_and_pixels(reconstruction)
     chosen = np.zeros(len(tracks.points), dtype=bool)
     chosen[:: -(-len(chosen) // most) or 1] = True
+    per_image = LONG_TRACK * most // max(reconstruction.num_reg_images(), 1)
+    while np.count_nonzero(chosen[tracks.point_rows]) > LONG_TRACK * most and per_image:
+        chosen = select_points(tracks.point_rows, tracks.images, len(chosen), per_image, 0)
+        per_image //= 2
     return with_points(reconstruction, tracks, pixels, chosen, split)

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from synthetic_scene import run_rounds, true_model
 
-from snakesfm.bundle import following, rounds
+from snakesfm.bundle import following, rounds, selection
 from snakesfm.bundle.ceres import adjust_ceres
 from snakesfm.bundle.following import Views, follow_cameras
 from snakesfm.bundle.interface import SolverSettings
 from snakesfm.bundle.model import from_reconstruction, to_reconstruction
-from snakesfm.bundle.selection import adjust_selection, select_points
+from snakesfm.bundle.selection import adjust_selection, select_points, with_some_points
 from snakesfm.geometry.poses import center_of
 from snakesfm.synthetic.problems import make_problem
 
@@ -49,6 +49,27 @@ def test_the_number_of_all_observations_chooses_all_points():
     model, _ = perturbed()
     owners = np.repeat(np.arange(len(model.points)), np.diff(model.offsets))
     assert select_points(owners, model.image_ids, len(model.points), 10_000, 0).all()
+
+
+def test_trials_take_a_number_of_points_spread_over_all():
+    _, reconstruction = perturbed()
+    trial = with_some_points(reconstruction, 50)
+    taken = np.array([point.xyz for point in trial.points3D.values()])
+    all_points = np.array([reconstruction.point3D(k).xyz for k in sorted(reconstruction.point3D_ids())])
+    every = -(-len(all_points) // 50)
+    np.testing.assert_array_equal(np.sort(taken, axis=0), np.sort(all_points[::every], axis=0))
+
+
+def test_trials_take_fewer_points_where_many_images_see_them(monkeypatch):
+    monkeypatch.setattr(selection, "LONG_TRACK", 2)
+    _, reconstruction = perturbed()
+    trial = with_some_points(reconstruction, 200)
+    observations = [trial.image(k).num_points3D for k in trial.reg_image_ids()]
+    assert 200 <= sum(observations) <= 400
+    # an even share would be 33 at most
+    assert min(observations) >= 8
+    again = with_some_points(trial, 200)
+    assert again.compute_num_observations() == sum(observations)
 
 
 @pytest.mark.parametrize("per_image", [60, 10_000])
