@@ -18,6 +18,15 @@ def rows_of_each(values: Array) -> list[tuple[int, Array]]:
     return list(zip(found.tolist(), np.split(order, starts[1:]), strict=True))
 
 
+def starts_of(*columns: Array) -> Array:
+    """Rows (n,) bool at which a run of rows begins that have the same values in all ``columns`` (n,)."""
+    starts = np.zeros(len(columns[0]), dtype=bool)
+    starts[:1] = True
+    for column in columns:
+        starts[1:] |= column[1:] != column[:-1]
+    return starts
+
+
 def offsets_of(lengths: ArrayLike) -> Array:
     """Offsets (n+1,) int64 of groups that follow each other: group k is the rows offsets[k]:offsets[k+1].
 

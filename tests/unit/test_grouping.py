@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from snakesfm.grouping import components_of, join_parts, offsets_of, one_to_one, sum_by
+from snakesfm.grouping import components_of, join_parts, offsets_of, one_to_one, starts_of, sum_by
 
 
 def test_offsets_begin_at_zero_and_are_wide_integers() -> None:
@@ -21,6 +21,13 @@ def test_parts_are_joined_and_none_keep_shapes_and_dtypes() -> None:
     offsets, columns = join_parts([], nothing)
     assert offsets.tolist() == [0] and offsets.dtype == np.int64
     assert [(part.shape, part.dtype) for part in columns] == [((0, 2), np.int32), ((0,), np.float32)]
+
+
+def test_runs_start_where_any_column_changes() -> None:
+    first, second = np.array([1, 1, 2, 2, 2]), np.array([7, 7, 7, 0, 0])
+    assert starts_of(first, second).tolist() == [True, False, True, True, False]
+    assert starts_of(first).tolist() == [True, False, True, False, False]
+    assert starts_of(first[:0]).tolist() == []
 
 
 @pytest.mark.parametrize("shape", [(), (3,), (3, 3)])

@@ -8,7 +8,7 @@ import numpy as np
 from snakesfm.arrays import Array
 from snakesfm.bundle.interface import BundleAdjuster, SolverSettings
 from snakesfm.bundle.reading import Tracks, read_tracks_and_pixels
-from snakesfm.bundle.selection import with_points
+from snakesfm.bundle.selection import LONG_TRACK, with_points
 from snakesfm.bundle.trials import error_shares
 from snakesfm.geometry.colmap_binding import pycolmap
 from snakesfm.geometry.lens_fit import MIN_IMAGES
@@ -17,8 +17,9 @@ from snakesfm.geometry.lens_fit import MIN_IMAGES
 SIGNIFICANCE = 3.0
 # the way of a far one is long, and neither half has gone it to the end
 FAR_SIGNIFICANCE = 10.0
-# more points than this tell no more of a few numbers, and cost time
+# more than these tell no more of a few numbers, and cost time
 POINTS_PER_HALF = 5000
+OBSERVATIONS_PER_HALF = LONG_TRACK * POINTS_PER_HALF
 COARSE = 10.0
 # a third of the image cut off on one side makes a quarter; the border is at a half
 LARGEST_OFFSET = 0.35
@@ -124,7 +125,8 @@ def _adjusted_half(
 ) -> pycolmap.Reconstruction:
     """A copy of the model of one half of the points, adjusted."""
     chosen = np.zeros(len(tracks.points), dtype=bool)
-    chosen[half :: max(2, len(chosen) // POINTS_PER_HALF)] = True
+    share = max(2, len(chosen) // POINTS_PER_HALF, len(tracks.images) // OBSERVATIONS_PER_HALF)
+    chosen[half::share] = True
     model = with_points(reconstruction, tracks, pixels, chosen)
     adjust(model, replace(solving, function_tolerance=solving.function_tolerance * COARSE))
     return model

@@ -1,6 +1,7 @@
 """Points, observations and keypoints of a ``pycolmap.Reconstruction`` as arrays."""
 
 import struct
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -57,6 +58,12 @@ def read_tracks_and_pixels(reconstruction: pycolmap.Reconstruction) -> tuple[Tra
         return tracks, _pixels(folder / IMAGES_FILE, tracks)
 
 
+def read_keypoints(reconstruction: pycolmap.Reconstruction) -> dict[int, Array]:
+    """The pixels (K,2) float64 of all keypoints of each registered image, by its id."""
+    with written_files(reconstruction) as folder:
+        return dict(_keypoints_of_images(folder / IMAGES_FILE))
+
+
 def points_in_cameras(reconstruction: pycolmap.Reconstruction, tracks: Tracks) -> tuple[Array, Array]:
     """Id of the camera (L,) int64 of each observation, and its point (L,3) in the camera's frame."""
     camera_of, points = np.empty(len(tracks.images), dtype=np.int64), np.empty((len(tracks.images), 3))
@@ -99,13 +106,17 @@ def _tracks(path: Path) -> Tracks:
 def _pixels(path: Path, tracks: Tracks) -> Array:
     pixels = np.empty((len(tracks.images), 2))
     of_image = dict(rows_of_each(tracks.images))
+    for image_id, keypoints in _keypoints_of_images(path):
+        mine = of_image.get(image_id - 1, slice(0))
+        pixels[mine] = keypoints[tracks.rows[mine]]
+    return pixels
+
+
+def _keypoints_of_images(path: Path) -> Iterator[tuple[int, Array]]:
     with path.open("rb") as file:
         for _ in range(COUNT.unpack(file.read(COUNT.size))[0]):
             image_id, _, count = read_image_head(file)
             content = file.read(count * KEYPOINT.itemsize)
             if len(content) < count * KEYPOINT.itemsize:
                 raise struct.error(f"{path.name} ends within the keypoints of an image")
-            keypoints = np.frombuffer(content, KEYPOINT)["xy"]
-            mine = of_image.get(image_id - 1, slice(0))
-            pixels[mine] = keypoints[tracks.rows[mine]]
-    return pixels
+            yield image_id, np.frombuffer(content, KEYPOINT)["xy"]

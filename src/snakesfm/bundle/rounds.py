@@ -39,6 +39,8 @@ EARLY_TOLERANCE = 300.0
 LONG_LENS_SHARE = 0.5
 # of the mean reprojection error, what another round leaves where principal points have arrived
 SETTLED_SHARE = 0.9
+# of the images, those that are registered before another pass
+PASS_SHARE = 0.05
 # early rounds come before all observations are there, final ones after, the last of which is exact
 Phase = Literal["early", "final", "last"]
 
@@ -133,8 +135,9 @@ class _Mapper:
         if phase == "early":
             solving = self.early_solving(threshold_px, holds_distortion)
         else:
-            # the solver takes most memory here, and few models need their matches again
-            self.held_graph = None
+            # the solver takes most memory in the last pass, and few models need their matches again
+            if phase == "last" or not left_out_images(self.reconstruction, self.registered_late):
+                self.held_graph = None
             solving = self.late_solving(phase)
         drop_short_tracks(self.reconstruction, settings.min_track_length, settings.sparse_observations)
         costs, wild, held = self.solve_with_wild_held(solving, phase)
@@ -342,18 +345,19 @@ class _Mapper:
         )
 
     def register(self) -> bool:
-        """Register what can be; whether something was.
+        """Register what can be, some after others until a pass is worth it; whether something was.
 
         An image that the adjustment throws out again is not tried twice, or that would go on for ever.
         """
-        settings = self.settings
-        done = self.place_left_out(
-            settings.register_error_px, settings.register_min_inliers, self.registered_late
-        )
-        self.registered_late.update(done)
-        if done:
+        limits = self.settings.register_error_px, self.settings.register_min_inliers
+        before = self.reconstruction.num_reg_images()
+        done = self.place_left_out(*limits, self.registered_late)
+        while done:
+            self.registered_late.update(done)
             self.complete(done)
-        return bool(done)
+            enough = self.reconstruction.num_reg_images() >= (1 + PASS_SHARE) * before
+            done = [] if enough else self.place_left_out(*limits, self.registered_late)
+        return self.reconstruction.num_reg_images() > before
 
     def set_long_lenses_aside(self) -> None:
         """Take out single images of lenses so long that the last pass would not settle them."""

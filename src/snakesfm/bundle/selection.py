@@ -16,6 +16,8 @@ from snakesfm.grouping import offsets_of
 
 # each image must see enough of them to tell its own numbers
 POINTS_PER_IMAGE = 15
+# images that see a point, twice what is usual
+LONG_TRACK = 10
 
 
 def select_points(point_rows: Array, images: Array, count: int, per_image: int, seed: int) -> Array:
@@ -141,9 +143,17 @@ def with_points(
 def with_some_points(
     reconstruction: pycolmap.Reconstruction, most: int, split: Container[int] = ()
 ) -> pycolmap.Reconstruction:
-    """The same with so many points at most, or 15 per image if more, spread over all: for trials."""
+    """The same with so many points at most, or 15 per image if more, spread over all: for trials.
+
+    Where these are seen by so many images that they cost more than as many usual ones, fewer that leave
+    each image about as many observations as any other.
+    """
     most = max(most, POINTS_PER_IMAGE * reconstruction.num_reg_images())
     tracks, pixels = read_tracks_and_pixels(reconstruction)
     chosen = np.zeros(len(tracks.points), dtype=bool)
     chosen[:: -(-len(chosen) // most) or 1] = True
+    per_image = LONG_TRACK * most // max(reconstruction.num_reg_images(), 1)
+    while np.count_nonzero(chosen[tracks.point_rows]) > LONG_TRACK * most and per_image:
+        chosen = select_points(tracks.point_rows, tracks.images, len(chosen), per_image, 0)
+        per_image //= 2
     return with_points(reconstruction, tracks, pixels, chosen, split)

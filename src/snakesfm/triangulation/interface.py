@@ -7,6 +7,7 @@ import numpy as np
 
 from snakesfm.arrays import Array
 from snakesfm.geometry.poses import to_camera
+from snakesfm.grouping import starts_of
 
 
 @dataclass(frozen=True)
@@ -95,7 +96,7 @@ def max_angles(rotations: Array, rays: Array, track_of: Array, used: Array, coun
     mean = mean / np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-12)
     chords = np.linalg.norm(rays_used - mean[tracks], axis=1)
     order = np.lexsort((-chords, tracks))
-    first = order[np.r_[True, np.diff(tracks[order]) != 0]]
+    first = order[starts_of(tracks[order])]
     farthest = np.zeros((count, 3))
     farthest[tracks[first]] = rays_used[first]
     spread = np.linalg.norm(rays_used - farthest[tracks], axis=1)

@@ -6,8 +6,10 @@ import cv2  # noqa: F401
 import numpy as np
 import pycolmap
 import pytest
+import synthetic_scene
 from synthetic_scene import graph_of, run_rounds
 
+from snakesfm.bundle import rounds
 from snakesfm.bundle.completion import complete_tracks, drop_repeated_observations
 from snakesfm.bundle.filtering import deregister_weak_images, drop_short_tracks, filter_observations
 from snakesfm.bundle.interface import SolverSettings
@@ -292,6 +294,35 @@ def test_left_out_images_get_a_last_round():
     assert np.isfinite(result.rotations).all()
     stays, _ = adjusted(made, perturbed(made, left_out=[6]), register_images=False)
     assert np.isnan(stays.rotations[6]).all()
+
+
+@pytest.mark.parametrize(("share", "rounds_of_registration"), [(0.05, 2), (0.2, 1)])
+def test_few_images_are_registered_after_others_without_a_pass(monkeypatch, share, rounds_of_registration):
+    monkeypatch.setattr(rounds, "PASS_SHARE", share)
+    graphs = []
+    monkeypatch.setattr(synthetic_scene, "graph_of", lambda made: graphs.append(1) or graph_of(made))
+    made = problem()
+    # image 7 has matches with image 6 alone
+    kept = (made.pairs != 7).all(axis=1) | (made.pairs == [6, 7]).all(axis=1)
+    lengths = np.diff(made.match_offsets)
+    made = replace(
+        made,
+        pairs=made.pairs[kept],
+        matches=made.matches[np.repeat(kept, lengths)],
+        match_offsets=np.r_[0, np.cumsum(lengths[kept])],
+    )
+    result, records = adjusted(made, perturbed(made, left_out=[6, 7]))
+    names = [record.name for record in records]
+    assert names == [
+        "round 1",
+        "round 2",
+        "round 3",
+        *["registration"] * rounds_of_registration,
+        "last pass",
+    ]
+    assert np.isfinite(result.rotations).all()
+    # it is kept as long as images are left out
+    assert len(graphs) == 1
 
 
 def test_an_image_that_is_thrown_out_again_is_registered_once():

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from synthetic_scene import run_rounds, true_model
 
-from snakesfm.bundle import following, rounds
+from snakesfm.bundle import following, rounds, selection
 from snakesfm.bundle.ceres import adjust_ceres
 from snakesfm.bundle.following import Views, follow_cameras
 from snakesfm.bundle.interface import SolverSettings
@@ -56,6 +56,18 @@ def test_trials_take_few_points_but_fifteen_for_each_image():
     assert 90 <= with_some_points(whole, 50).num_points3D() <= 15 * 12
     assert 200 <= with_some_points(whole, 400).num_points3D() <= 400
     assert with_some_points(whole, 1000).num_points3D() == whole.num_points3D()
+
+
+def test_trials_take_fewer_points_where_many_images_see_them(monkeypatch):
+    monkeypatch.setattr(selection, "LONG_TRACK", 2)
+    _, reconstruction = perturbed()
+    trial = with_some_points(reconstruction, 200)
+    observations = [trial.image(k).num_points3D for k in trial.reg_image_ids()]
+    assert 200 <= sum(observations) <= 400
+    # an even share would be 33 at most
+    assert min(observations) >= 8
+    again = with_some_points(trial, 200)
+    assert again.compute_num_observations() == sum(observations)
 
 
 @pytest.mark.parametrize("per_image", [60, 10_000])
