@@ -47,12 +47,10 @@ class PositioningSettings:
 
 @dataclass(frozen=True)
 class AveragedCenters:
-    """Centres of N cameras, and how well E edges and Q rays agree with them."""
+    """Centres of N cameras, and how well Q rays agree with them."""
 
     centers: Array
     """(N,3), NaN where there is none; the median edge is one unit long and the median centre the origin."""
-    edge_residuals_rad: Array
-    """(E) NaN where a centre is missing."""
     ray_residuals_rad: Array
     """(Q) of the rays that took part, NaN where a centre is missing."""
     ray_images: Array
@@ -192,7 +190,6 @@ def average_translations(problem: PositioningProblem, settings: PositioningSetti
     centers = normalize_gauge(part, centers)
     return AveragedCenters(
         centers=centers,
-        edge_residuals_rad=edge_angles_rad(problem, centers),
         ray_residuals_rad=angles_rad(chosen, centers, locate_landmarks(chosen, centers)),
         ray_images=chosen.ray_images,
     )

@@ -74,7 +74,7 @@ def test_whole_averaging_with_noise_and_outliers(layout, most):
     assert np.isfinite(result.centers).all()
     assert 1e-3 < np.median(found) < most
     assert found.max() < 3 * most
-    good = result.edge_residuals_rad[~truth.edge_outliers]
+    good = edge_angles_rad(problem, result.centers)[~truth.edge_outliers]
     assert np.degrees(np.median(good)) < 3.0
     assert np.degrees(np.median(result.ray_residuals_rad)) < 0.2
 
