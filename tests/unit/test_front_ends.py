@@ -343,9 +343,12 @@ def test_keypoints_that_only_choose_pairs_have_their_network_too(
     assert scene.gpus("extract_features") == len(models)
 
 
-def test_large_images_ask_for_what_they_take(tmp_path: Path) -> None:
+def test_large_images_and_many_keypoints_ask_for_what_they_take(tmp_path: Path) -> None:
     (scene,) = plan_of(tmp_path, extract_features={"max_shorter_side_px": 1520}).scenes.values()
     assert scene.load("extract_features").area == 4.0
+    assert scene.load("match_pairs").keypoints == 1.0
+    (scene,) = plan_of(tmp_path, extract_features={"max_keypoints": 12_000}).scenes.values()
+    assert scene.load("match_pairs").keypoints == 2.4
 
 
 def test_one_file_of_weights_serves_one_network(tmp_path: Path) -> None:

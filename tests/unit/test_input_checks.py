@@ -3,15 +3,16 @@
 import os
 import resource
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
 import pytest
 
-from snakesfm.artifacts import Header, ImagePairs, base
+from snakesfm.artifacts import Header, ImagePairs, base, checks
 from snakesfm.artifacts.checks import check_content, check_inputs, set_aside
 from snakesfm.digests import options_digest
 from snakesfm.errors import ArtifactError, UnreadableArtifactError
@@ -146,7 +147,9 @@ def no_more_files() -> Iterator[None]:
         resource.setrlimit(resource.RLIMIT_NOFILE, before)
 
 
-def test_a_file_that_cannot_be_read_for_a_moment_stays(tmp_path: Path) -> None:
+def test_a_file_that_cannot_be_read_for_a_moment_stays(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     foreign, good = write_pairs(tmp_path / "0-0.h5", scene="t"), write_pairs(tmp_path / "0-1.h5")
     for check in (lambda: check_inputs([good], "s", DIGESTS), lambda: check_content([good])):
         with no_more_files(), pytest.raises(UnreadableArtifactError) as caught:
@@ -156,8 +159,17 @@ def test_a_file_that_cannot_be_read_for_a_moment_stays(tmp_path: Path) -> None:
         )
     with no_more_files(), pytest.raises(UnreadableArtifactError):
         ImagePairs.read(good)
-    assert sorted(tmp_path.iterdir()) == [foreign, good]
     check_inputs([good], "s", DIGESTS)
+
+    def fail_one(path: Path) -> Mapping[str, Any]:
+        if path == good:
+            raise UnreadableArtifactError(path)
+        return base.read_header(path)
+
+    monkeypatch.setattr(checks, "read_header", fail_one)
+    with pytest.raises(UnreadableArtifactError):
+        check_inputs([foreign, good], "s", DIGESTS)
+    assert sorted(tmp_path.iterdir()) == [foreign, good]
 
 
 @pytest.mark.parametrize(

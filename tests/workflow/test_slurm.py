@@ -264,8 +264,16 @@ def test_what_is_edited_while_a_run_goes_on_is_for_the_next(
     pid, _ = wait_for_process(output / "logs" / "adjust_bundle" / "job.log", run)
     os.kill(pid, signal.SIGSTOP)
     file.write_text("export_model: {all_keypoints: true}\n")
-    os.kill(pid, signal.SIGCONT)
-    text, _ = run.communicate(timeout=300)
+    # so many images are dealt into other blocks
+    late = [small_scene / "images" / f"late_{number}.jpg" for number in range(50)]
+    try:
+        for image in late:
+            image.touch()
+        os.kill(pid, signal.SIGCONT)
+        text, _ = run.communicate(timeout=300)
+    finally:
+        for image in late:
+            image.unlink(missing_ok=True)
     assert run.returncode == 0, text
     assert model_bytes(output) == model_bytes(finished[0])
     last = on_slurm.run(*arguments)
