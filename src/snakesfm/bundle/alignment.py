@@ -86,14 +86,18 @@ class _Templates:
         )
 
 
-def choose_templates(directions: Array, sizes: Array, inside: Array, offsets: Array) -> Array:
-    """The observation of each point whose view is the most central one.
+def choose_templates(
+    directions: Array, sizes: Array, inside: Array, blurred: Array, offsets: Array
+) -> Array:
+    """The observation of each point whose view is the most central one of those that are not blurred.
+
+    Sharp patches do not align well to a blurred one, and scatter more where they do.
 
     Parameters
     ----------
     directions : (L,3) unit rays from the points' cameras, in the world.
     sizes : (L,) log of how large the point's surroundings appear.
-    inside : (L,) bool, whether the patch lies in the image.
+    inside, blurred : (L,) bool, whether the patch lies in the image, and whether the image is blurred.
     offsets : (T+1,) int64, rows ``offsets[k]:offsets[k+1]`` belong to point k.
 
     Returns
@@ -107,7 +111,7 @@ def choose_templates(directions: Array, sizes: Array, inside: Array, offsets: Ar
     cosines = np.einsum("li,li->l", directions, mean[point_of])
     level = np.add.reduceat(sizes, offsets[:-1]) / counts
     oddness = np.arccos(np.clip(cosines, -1.0, 1.0)) + np.abs(sizes - level[point_of])
-    order = np.lexsort((oddness, ~inside, point_of))
+    order = np.lexsort((oddness, blurred, ~inside, point_of))
     return np.asarray(order[offsets[:-1]])
 
 

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from snakesfm.ingest.read import ImagePixels
 
 HELD_PIXELS = 256 * USUAL_SIDE_PX * (USUAL_SIDE_PX * 3 // 2)
-"""Gray values that are kept, as each image is read twice: those of so many photographs of usual size."""
+"""Gray values that are kept, as each image is read thrice: those of so many photographs of usual size."""
 LEAST_GAIN = 1.25
 """Images that are less finer than those before tell nothing new."""
 RADIUS_GROWTH = 0.68

@@ -1,6 +1,6 @@
 """Refinement of a reconstruction's keypoints by aligning them to each other in the images."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -11,7 +11,9 @@ from snakesfm.bundle.alignment import (
     align_observations,
     choose_templates,
 )
+from snakesfm.bundle.image_sources import ImageSource
 from snakesfm.bundle.reading import read_tracks_and_pixels
+from snakesfm.bundle.sharpness import find_blurred
 from snakesfm.geometry.colmap_binding import pycolmap
 from snakesfm.grouping import rows_of_each
 
@@ -30,11 +32,24 @@ def most_share_a_camera(camera_ids: Array) -> bool:
     return bool(np.mean(counts[cameras] > 1) > 0.5)
 
 
+def refine_by_sources(reconstruction: pycolmap.Reconstruction, sources: Sequence[ImageSource]) -> None:
+    """Refine keypoints in the images of each source in turn; those of the first tell which are blurred."""
+    if not sources:
+        return
+    blurred = find_blurred(reconstruction, sources[0])
+    for source in sources:
+        source.report(
+            *refine_keypoints(reconstruction, source.read_gray, source.scales, source.settings, blurred)
+        )
+        source.release()
+
+
 def refine_keypoints(
     reconstruction: pycolmap.Reconstruction,
     read_gray: Callable[[int], GrayImage | None],
     gray_scales: Array,
     settings: AlignmentSettings,
+    blurred: Sequence[int] = (),
 ) -> tuple[int, int]:
     """Align the observations of every point to the most central one, and move the image's keypoints there.
 
@@ -47,6 +62,7 @@ def refine_keypoints(
     read_gray : gives image k (row, not id), or None where there are no pixels.
     gray_scales : (N,) how many of the keypoints' pixels a pixel of each gray image is wide, at most.
     settings : how.
+    blurred : rows of the images to whose observations others are aligned only where a point has no other.
 
     Returns
     -------
@@ -59,7 +75,7 @@ def refine_keypoints(
     offsets = np.searchsorted(point_of, np.arange(len(tracks.points) + 1))
     directions, sizes, tangents = _views(reconstruction, tracks.points, point_of, images, offsets)
     inside = _patch_inside(reconstruction, images, pixels, gray_scales, settings.radius_px)
-    chosen = choose_templates(directions, sizes, inside, offsets)
+    chosen = choose_templates(directions, sizes, inside, np.isin(images, blurred), offsets)
     moved, aligned = align_observations(
         read_gray, images, pixels, tangents, chosen[point_of], inside, settings
     )

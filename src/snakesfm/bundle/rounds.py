@@ -22,7 +22,7 @@ from snakesfm.bundle.focal_pairs import (
 from snakesfm.bundle.image_sources import ImageSource
 from snakesfm.bundle.interface import SolverSettings, bundle_adjuster
 from snakesfm.bundle.keypoint_noise import keypoint_noise_px
-from snakesfm.bundle.keypoint_refinement import refine_keypoints
+from snakesfm.bundle.keypoint_refinement import refine_by_sources
 from snakesfm.bundle.lenses import find_wider_lenses
 from snakesfm.bundle.mixed_focals import find_mixed_focals
 from snakesfm.bundle.principal_points import find_told_cameras, shared_cameras
@@ -195,11 +195,7 @@ class _Mapper:
         """What comes before a round: tracks are completed, and keypoints refined by each of ``sources``."""
         if completing:
             self.complete()
-        for source in sources:
-            source.report(
-                *refine_keypoints(self.reconstruction, source.read_gray, source.scales, source.settings)
-            )
-            source.release()
+        refine_by_sources(self.reconstruction, sources)
 
     def widen_lenses(self) -> bool:
         """After a round, give cameras whose lens is not of their model a wider one; whether some were."""

@@ -12,9 +12,11 @@ from snakesfm.bundle.alignment import (
     align_observations,
     choose_templates,
 )
-from snakesfm.bundle.keypoint_refinement import most_share_a_camera, refine_keypoints
+from snakesfm.bundle.image_sources import ImageSource
+from snakesfm.bundle.keypoint_refinement import most_share_a_camera, refine_by_sources, refine_keypoints
 from snakesfm.bundle.model import BundleModel, to_reconstruction
 from snakesfm.bundle.reading import read_tracks, read_tracks_and_pixels
+from snakesfm.bundle.sharpness import find_blurred
 from snakesfm.geometry.camera import Camera
 from snakesfm.geometry.rotations import exp_so3
 
@@ -108,11 +110,12 @@ def model_of(scene, noise_px: float):
     return to_reconstruction(model, keypoints, [f"{k}.jpg" for k in range(5)])
 
 
-def spread_px(reconstruction, pixels: np.ndarray) -> np.ndarray:
+def spread_px(reconstruction, pixels: np.ndarray, without: int = -1) -> np.ndarray:
     """How far (L,) the keypoints of a point are from their true places, up to what all of them share."""
     tracks, places = read_tracks_and_pixels(reconstruction)
-    offsets = places - pixels[tracks.images, tracks.rows]
-    point_of = tracks.point_rows
+    counted = tracks.images != without
+    offsets = (places - pixels[tracks.images, tracks.rows])[counted]
+    point_of = tracks.point_rows[counted]
     sums = np.zeros((len(tracks.points), 2))
     np.add.at(sums, point_of, offsets)
     return np.linalg.norm(offsets - (sums / np.bincount(point_of)[:, None])[point_of], axis=1)
@@ -232,14 +235,64 @@ def test_patches_outside_do_not_move(scene):
     assert not aligned.any()
 
 
-def test_the_template_is_the_central_view_with_its_patch_inside():
+def test_the_template_is_the_central_view_with_its_patch_inside_a_sharp_image():
     angles = np.array([-0.4, 0.05, 0.5])
     directions = np.column_stack([np.sin(angles), np.zeros(3), np.cos(angles)])
     offsets = np.array([0, 3])
-    inside = np.ones(3, bool)
-    assert choose_templates(directions, np.zeros(3), inside, offsets).tolist() == [1]
-    assert choose_templates(directions, np.array([0.0, 2.0, 0.0]), inside, offsets).tolist() != [1]
-    assert choose_templates(directions, np.zeros(3), np.array([True, False, True]), offsets).tolist() == [0]
+
+    def chosen(sizes=(0.0, 0.0, 0.0), inside=(True, True, True), blurred=(False, False, False)):
+        columns = np.array(sizes), np.array(inside), np.array(blurred)
+        return choose_templates(directions, *columns, offsets).tolist()
+
+    assert chosen() == [1]
+    assert chosen(sizes=(0.0, 2.0, 0.0)) != [1]
+    assert chosen(inside=(True, False, True)) == [0]
+    assert chosen(blurred=(False, True, False)) == [0]
+    # outside there is nothing to align to
+    assert chosen(inside=(False, True, False), blurred=(False, True, False)) == [1]
+    assert chosen(blurred=(True, True, True)) == [1]
+
+
+def in_motion(image: np.ndarray) -> np.ndarray:
+    """An image blurred over nine pixels of a row."""
+    return cv2.blur(image, (9, 1))
+
+
+def source_of(images, threads: int = 1) -> ImageSource:
+    settings = AlignmentSettings(threads=threads)
+    return ImageSource(read(images), np.ones(5), settings, lambda aligned, count: None, lambda: None)
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_blurred_images_are_told_from_those_of_even_surfaces_and_of_dim_light(scene, threads: int):
+    look = texture(0)
+    even = look[:, :600]
+    even[:] = cv2.GaussianBlur(even, (0, 0), 5)
+    images = [render(look, plane_to_image(*pose)) for pose in scene[2]]
+    images[1] = in_motion(images[1])
+    images[3] = (images[3] * 0.3).astype(np.uint8)
+    reconstruction = model_of(scene, 0.2)
+    for row in np.flatnonzero(scene[0][:, 0] > -0.2).tolist():
+        reconstruction.delete_observation(5, row)
+    assert find_blurred(reconstruction, source_of(images, threads)) == [1]
+
+
+def test_no_image_is_blurred_where_none_can_be_read_or_none_is_sharper(scene):
+    assert find_blurred(model_of(scene, 0.2), source_of([None] * 5)) == []
+    assert find_blurred(model_of(scene, 0.2), source_of([in_motion(image) for image in scene[1]])) == []
+    assert find_blurred(model_of(scene, 0.2), source_of([np.zeros((300, 400), np.uint8)] * 5)) == []
+
+
+def test_sharp_images_align_as_well_beside_a_blurred_one(scene):
+    """Though that one is the most central view, and the template of most points where all are sharp."""
+    images = list(scene[1])
+    images[2] = in_motion(images[2])
+    sharp, beside, to_blurred = (model_of(scene, 0.35) for _ in range(3))
+    refine_by_sources(sharp, [source_of(scene[1])])
+    refine_by_sources(beside, [source_of(images)])
+    refine_keypoints(to_blurred, read(images), np.ones(5), SETTINGS)
+    found = [np.median(spread_px(model, scene[3], without=2)) for model in (sharp, beside, to_blurred)]
+    assert 0.001 < found[1] < 1.2 * found[0] < 0.5 * found[2]
 
 
 @pytest.mark.parametrize(
