@@ -10,7 +10,7 @@ from snakesfm.config.base import StageOptions
 class BuildTracksOptions(StageOptions):
     """How matches are joined to tracks."""
 
-    stage_version: ClassVar[int] = 6
+    stage_version: ClassVar[int] = 7
 
     min_length: int = Field(default=3, ge=2)
     """Number of images that a track must be seen in; 2 if only two images have a rotation."""

@@ -10,7 +10,7 @@ from snakesfm.config.base import StageOptions
 class CalibrateCamerasOptions(StageOptions):
     """How unknown focal lengths are estimated before any pose is known."""
 
-    stage_version: ClassVar[int] = 9
+    stage_version: ClassVar[int] = 10
 
     estimate_focals: bool = True
     """Estimate unknown focal lengths from fundamental matrices; otherwise the priors are kept."""
