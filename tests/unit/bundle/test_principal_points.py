@@ -7,7 +7,9 @@ import numpy as np
 import pytest
 from synthetic_scene import run_rounds, true_model
 
+from snakesfm.bundle import principal_points
 from snakesfm.bundle.interface import SolverSettings
+from snakesfm.bundle.model import to_reconstruction
 from snakesfm.geometry.camera import Camera
 from snakesfm.synthetic.problems import make_problem
 
@@ -36,6 +38,23 @@ def test_a_well_told_principal_point_is_found():
     np.testing.assert_allclose(params[0, 1:3], OFFSET.params[1:3], atol=0.9)
     np.testing.assert_allclose(params[0, 0], 500.0, atol=1.0)
     assert np.linalg.norm(params[0, 1:3] - CENTRED.params[1:3]) > 4.0
+
+
+@pytest.mark.parametrize("most", [200, 10_000])
+def test_halves_are_of_fewer_points_where_many_images_see_them(monkeypatch, most):
+    monkeypatch.setattr(principal_points, "OBSERVATIONS_PER_HALF", most)
+    made = make_problem(12, 1000, camera=CENTRED, seed=5)
+    model = to_reconstruction(true_model(made), made.keypoints, [f"{k}.jpg" for k in range(12)])
+    counts = []
+
+    def adjust(half, solving):
+        counts.append(half.compute_num_observations())
+        return 0.0, 0.0
+
+    principal_points.find_told_cameras(model, adjust, SolverSettings(), 0.003, (0.004, 0.02))
+    half = model.compute_num_observations() / 2
+    assert len(counts) == 2 and 400 < half < 10_000
+    assert all(0.5 * most < count < 1.5 * most if most < half else 0.9 * half < count for count in counts)
 
 
 def test_one_far_off_is_found_where_the_errors_fall_clearly():
