@@ -101,7 +101,7 @@ NEEDS = {
 }
 
 
-# what a network takes beside, on a processor: LoFTR took 1.5 GB with the images that it holds, and 8.4 s
+# what a network takes beside, on a processor: LoFTR took 1.6 GB with the images that it holds, and 8.4 s
 # per pair of 840 x 632, and DISK 2.0 GB more for every further image of 1140 x 760 in a batch
 NETWORK_MB, NETWORK_IMAGE_S, NETWORK_PAIR_S = 2600, 10.0, 17.0
 

@@ -252,8 +252,8 @@ class ScenePlan:
         batch = 1 if wanted == "auto" else wanted
         pairs = self.proposed_pair_count if stage == "select_pairs" else self.pair_count
         of = self.configuration.extract_features
-        sizes = (of.max_shorter_side_px, of.max_keypoints)
-        load = job_load(stage, self.image_count, self.blocks, pairs, networks, batch, *sizes)
+        size = of.max_shorter_side_px, of.max_keypoints
+        load = job_load(stage, self.image_count, self.blocks, pairs, networks, batch, *size)
         return replace(load, undistorting=threads) if stage == "export_model" and self.undistorts else load
 
     def final_files(self) -> list[str]:
@@ -340,14 +340,13 @@ class ScenePlan:
             settings |= self.mask_settings(main_process)
             return settings | self.weight_settings(stage, main_process) | self.source_settings(stage)
         if stage == "match_pairs":
-            learned = self.weight_settings(stage, main_process)
-            known = learned | self.source_settings(stage)
+            known = self.weight_settings(stage, main_process) | self.source_settings(stage)
             if self.detector_free:
                 return {"images": str(self.images)} | known
             return {"detector": self.method("extract_features")} | known
         if stage == "describe_images" and self.describes_pictures:
-            settings = {"images": str(self.images), "block": int(wildcards["block"])}
-            return settings | self.weight_settings(stage, main_process)
+            block = {"images": str(self.images), "block": int(wildcards["block"])}
+            return block | self.weight_settings(stage, main_process)
         if stage == "merge_keypoints":
             return {"images": str(self.images), "block": int(wildcards["block"])}
         if stage == "select_pairs":

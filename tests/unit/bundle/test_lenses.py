@@ -80,7 +80,7 @@ def test_the_stage_looks_for_wider_lenses_where_no_model_is_wanted(tmp_path, wan
     inputs = write_scene(made, tmp_path)
     edges, images = np.zeros(len(made.pairs)), np.zeros(14, int)
     CameraRotations(made.rotations, edges, edges.astype(int), images).write(inputs["rotations"], HEADER)
-    CameraCenters(made.centers, edges, np.zeros(0)).write(inputs["centers"], HEADER)
+    CameraCenters(made.centers, images, edges, np.zeros(0)).write(inputs["centers"], HEADER)
     TriangulatedPoints(
         made.points,
         made.track_offsets,
