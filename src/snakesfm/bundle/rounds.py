@@ -353,7 +353,7 @@ class _Mapper:
             self.complete(done)
             enough = self.reconstruction.num_reg_images() >= (1 + PASS_SHARE) * before
             done = [] if enough else self.place_left_out(*limits, self.registered_late)
-        return self.reconstruction.num_reg_images() > before
+        return bool(self.reconstruction.num_reg_images() > before)
 
     def set_long_lenses_aside(self) -> None:
         """Take out single images of lenses so long that the last pass would not settle them."""
