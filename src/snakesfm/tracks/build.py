@@ -8,9 +8,6 @@ from snakesfm.arrays import Array
 from snakesfm.grouping import components_of, offsets_of, starts_of
 from snakesfm.tracks.confirmation import unconfirmed_links
 
-MAX_AMBIGUOUS = 0.1
-"""Of the images of a component, those it may see at two places and still be one point in the others."""
-
 
 @dataclass(frozen=True)
 class Tracks:
@@ -43,10 +40,10 @@ def build_tracks(
 ) -> Tracks:
     """Join matches to tracks that see each image at most once.
 
-    Connected components of the match graph. Those that see an image at two places are dropped, or where
-    these are few of their images, lose them. SIFT gives one place once per dominant orientation; such
-    keypoints make tracks of their own unless a match joins them. Without the links of
-    :func:`snakesfm.tracks.confirmation.unconfirmed_links` a track falls into parts.
+    Connected components of the match graph. Those that see an image at two places are dropped. SIFT gives
+    one place once per dominant orientation; such keypoints make tracks of their own unless a match joins
+    them. Without the links of :func:`snakesfm.tracks.confirmation.unconfirmed_links` a track falls into
+    parts.
 
     Parameters
     ----------
@@ -62,9 +59,8 @@ def build_tracks(
     -------
     Tracks sorted by their first observation.
 
-    Source: Moulon and Monasse, Unordered feature tracking made fast and easy, CVMP 2012, where all
-    components in conflict are dropped; parts and the exceptions for those with few images in conflict and
-    for sparse images are this project's own.
+    Source: Moulon and Monasse, Unordered feature tracking made fast and easy, CVMP 2012, where components
+    in conflict are dropped; parts and the exception for sparse images are this project's own.
     """
     base = offsets_of([len(k) for k in keypoints])
     pair_of = np.repeat(np.arange(len(pairs)), np.diff(offsets))
@@ -80,9 +76,9 @@ def build_tracks(
     parts = components_of(len(nodes), links[~unconfirmed_links(links, images)])
     labels = components_of(len(nodes), links)
     positions = np.concatenate(keypoints)[nodes] if len(nodes) else np.zeros((0, 2))
-    ambiguous = _ambiguous(labels, images, positions, merge_radius_px)
-    conflicts = len(np.unique(labels[ambiguous]))
-    labels[ambiguous] = -1
+    in_conflict = _conflicting(labels, images, positions, merge_radius_px)
+    conflicts = len(np.unique(labels[in_conflict]))
+    labels[in_conflict] = -1
     observed = _one_per_image(labels, images, np.bincount(links.ravel(), minlength=len(nodes)))
     labels, parts, images = labels[observed], parts[observed], images[observed]
     rows = nodes[observed] - base[images]
@@ -93,21 +89,17 @@ def build_tracks(
     return _assemble(labels, parts, images, rows, long | (of_sparse & (lengths >= 2)), conflicts)
 
 
-def _ambiguous(labels: Array, images: Array, positions: Array, merge_radius_px: float) -> Array:
-    """Nodes (K,) bool of images that their component sees at places further apart than ``merge_radius_px``.
-
-    Of components that see more than ``MAX_AMBIGUOUS`` of their images so, all nodes.
-    """
+def _conflicting(labels: Array, images: Array, positions: Array, merge_radius_px: float) -> Array:
+    """Nodes (K,) bool of components that see one image at places further apart than ``merge_radius_px``."""
     # nodes ascend by image
     order = np.argsort(labels, kind="stable")
     starts = np.flatnonzero(starts_of(labels[order], images[order]))
-    points, component_of = positions[order], labels[order][starts]
-    extent = np.maximum.reduceat(points, starts) - np.minimum.reduceat(points, starts)
-    twice = np.hypot(*extent.T) > merge_radius_px
-    dropped = np.bincount(component_of, twice) > MAX_AMBIGUOUS * np.bincount(component_of)
-    ambiguous = np.empty(len(labels), dtype=bool)
-    ambiguous[order] = np.repeat(twice | dropped[component_of], np.diff(starts, append=len(labels)))
-    return ambiguous
+    bad = np.zeros(int(labels.max(initial=-1)) + 1, dtype=bool)
+    if len(starts) < len(order):
+        points = positions[order]
+        extent = np.maximum.reduceat(points, starts) - np.minimum.reduceat(points, starts)
+        bad[labels[order][starts[np.hypot(*extent.T) > merge_radius_px]]] = True
+    return np.asarray(bad[labels])
 
 
 def _one_per_image(labels: Array, images: Array, degrees: Array) -> Array:

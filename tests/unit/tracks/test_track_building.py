@@ -110,15 +110,6 @@ def test_conflict_is_dropped_whole():
     assert as_sets(tracks) == [] and tracks.conflicts == 1
 
 
-@pytest.mark.parametrize(("images", "kept"), [(9, False), (10, True)])
-def test_few_images_seen_twice_are_left_out_of_a_track_that_stays(images, kept):
-    # the last image sees the point at two places
-    table = joined(clique(range(images), 0), {(0, images - 1): [(0, 1)]})
-    tracks = build_tracks(spread_keypoints(images, 2), *matches_of(table))
-    assert as_sets(tracks) == ([[(image, 0) for image in range(images - 1)]] if kept else [])
-    assert tracks.conflicts == 1
-
-
 def test_near_keypoints_of_one_image_are_one_observation():
     keypoints = spread_keypoints(3, 3)
     keypoints[1][1] = keypoints[1][0] + np.float32(0.5)
