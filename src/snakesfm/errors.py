@@ -15,6 +15,7 @@ import errno
 
 LACK_OF_SPACE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 LACK_OF_RIGHTS = (errno.EACCES, errno.EPERM, errno.EROFS)
+LASTING = (errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.ENAMETOOLONG, errno.ELOOP, errno.EINVAL)
 
 
 class SnakesfmError(Exception):
@@ -46,7 +47,9 @@ class UnreadableArtifactError(ArtifactError):
 
 
 def remedy_of(number: int) -> str:
-    """What to do about an error of the system, by its number: others than these pass by themselves."""
+    """What to do about an error of the system, by its number."""
     if number in LACK_OF_SPACE + LACK_OF_RIGHTS:
         return "free the disk or correct the permission, then run again"
+    if number in LASTING:
+        return "correct the path or what lies there, then run again"
     return "start the same command again"

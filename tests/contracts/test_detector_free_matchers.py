@@ -133,11 +133,12 @@ class TestLoftr(DetectorFreeContract):
         renamed = [replace(part, name=f"once {part.name}") for part in pictures]
         for i, j in ((0, 1), (0, 2), (1, 2)):
             self.match(matcher, renamed[i], renamed[j])
-        assert len(seen) == 3
-        for number in range(HELD_FEATURES):
+        # the second image once on each side
+        assert len(seen) == 4
+        for number in range(HELD_FEATURES[1]):
             self.match(matcher, renamed[2], replace(pictures[0], name=f"more {number}"))
         self.match(matcher, renamed[2], renamed[0])
-        assert len(seen) == 3 + HELD_FEATURES + 1
+        assert len(seen) == 4 + 1 + HELD_FEATURES[1] + 1
 
     def test_long_images_are_matched(self, matcher):
         long = picture(shapes(960, 70)[0], "long")

@@ -6,7 +6,6 @@ temporary name in the same folder and renamed, so a file that is there is comple
 """
 
 import dataclasses
-import errno
 import json
 import os
 import re
@@ -25,7 +24,7 @@ import numpy as np
 import snakesfm
 from snakesfm.arrays import Array
 from snakesfm.atomic import atomic_path
-from snakesfm.errors import ArtifactError, UnreadableArtifactError, remedy_of
+from snakesfm.errors import LASTING, ArtifactError, UnreadableArtifactError, remedy_of
 
 TEMPORARY = ".export."
 STRING = h5py.string_dtype("utf-8")
@@ -243,7 +242,7 @@ def _refuse_unreadable(path: Path | str, error: Exception) -> None:
     """
     found = re.search(r"\berrno = (\d+)", str(error))
     number = int(found[1]) if found else getattr(error, "errno", None)
-    if number and number != errno.ENOENT:
+    if number and number not in LASTING:
         reason = os.strerror(number)
         raise UnreadableArtifactError(
             f"{path} cannot be read now ({reason}): {remedy_of(number)}."

@@ -1,5 +1,6 @@
 """Completion of the model: tracks are completed and merged, points triangulated from unused matches."""
 
+import functools
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -13,6 +14,8 @@ from snakesfm.grouping import offsets_of, starts_of
 SMALLEST_ANGLE_DEG = 1e-9
 # of all matches, in ordinary sets .95 and more, of 30 near copies of each photograph .5
 MOST_WITH_PARALLAX = 0.9
+# that are looked at first: where most of their matches have parallax, no others need be
+SOME_PAIRS = 100
 
 
 def correspondence_graph(
@@ -78,9 +81,9 @@ def complete_tracks(
     options.min_angle = max(min_angle_deg, SMALLEST_ANGLE_DEG)
     options.ignore_two_view_tracks = True
     options.random_seed = seed
-    creating = pycolmap.IncrementalTriangulator(
-        matches_with_parallax(reconstruction, graph, options.min_angle), reconstruction
-    )
+    # to look at all matches is worth it for many images
+    telling = graph if images else matches_with_parallax(reconstruction, graph, options.min_angle)
+    creating = pycolmap.IncrementalTriangulator(telling, reconstruction)
     registered = sorted(reconstruction.reg_image_ids())
     for image_id in registered if images is None else [row + 1 for row in images]:
         creating.triangulate_image(options, image_id)
@@ -99,26 +102,35 @@ def matches_with_parallax(
     near copies match. Left out are matches of two keypoints of which neither has a match whose ray is off
     its own by half the angle: the rays of no two of its matches are by the whole.
     """
-    rays = {}
-    for image_id, pixels in read_keypoints(reconstruction).items():
+    pixels = read_keypoints(reconstruction)
+    chord = 2.0 * np.sin(np.radians(min_angle_deg) / 4.0)
+
+    @functools.cache
+    def rays_of(image_id: int) -> Array:
         image = reconstruction.image(image_id)
         camera = reconstruction.camera(image.camera_id)
-        seen = np.column_stack([camera.cam_from_img(pixels), np.ones(len(pixels))])
+        seen = np.column_stack([camera.cam_from_img(pixels[image_id]), np.ones(len(pixels[image_id]))])
         seen = seen @ image.cam_from_world().rotation.matrix()
-        rays[image_id] = seen / np.linalg.norm(seen, axis=1, keepdims=True)
-    told = {image_id: np.zeros(len(of_image), dtype=bool) for image_id, of_image in rays.items()}
-    chord = 2.0 * np.sin(np.radians(min_angle_deg) / 4.0)
-    found = {}
-    for i, j in sorted(map(pycolmap.pair_id_to_image_pair, graph.image_pairs())):
-        if i in rays and j in rays:
-            found[i, j] = graph.extract_matches_between_images(i, j)
-            first, second = found[i, j].T
-            # a ray that is not finite tells nothing
-            wide = ~(np.linalg.norm(rays[i][first] - rays[j][second], axis=1) < chord)
-            told[i][first[wide]] = told[j][second[wide]] = True
-    kept = {(i, j): m[told[i][m[:, 0]] | told[j][m[:, 1]]] for (i, j), m in found.items()}
+        return np.asarray(seen / np.linalg.norm(seen, axis=1, keepdims=True))
+
+    def matches_of(i: int, j: int) -> tuple[Array, Array]:
+        matches = graph.extract_matches_between_images(i, j)
+        apart = np.linalg.norm(rays_of(i)[matches[:, 0]] - rays_of(j)[matches[:, 1]], axis=1)
+        # a ray that is not finite tells nothing
+        return matches, ~(apart < chord)
+
+    pairs = sorted(map(pycolmap.pair_id_to_image_pair, graph.image_pairs()))
+    pairs = [(i, j) for i, j in pairs if i in pixels and j in pixels]
+    some = [matches_of(i, j)[1] for i, j in pairs[:: max(1, len(pairs) // SOME_PAIRS)]]
+    if not some or np.mean(np.concatenate(some)) >= MOST_WITH_PARALLAX:
+        return graph
+    found = {pair: matches_of(*pair) for pair in pairs}
+    told = {image_id: np.zeros(len(of_image), dtype=bool) for image_id, of_image in pixels.items()}
+    for (i, j), (matches, wide) in found.items():
+        told[i][matches[wide, 0]] = told[j][matches[wide, 1]] = True
+    kept = {(i, j): m[told[i][m[:, 0]] | told[j][m[:, 1]]] for (i, j), (m, _) in found.items()}
     lengths = [len(matches) for matches in kept.values()]
-    if sum(lengths) >= MOST_WITH_PARALLAX * sum(map(len, found.values())):
+    if sum(lengths) >= MOST_WITH_PARALLAX * sum(len(matches) for matches, _ in found.values()):
         return graph
     counts = {image_id - 1: image.num_points2D() for image_id, image in reconstruction.images.items()}
     rows = np.array(list(kept), dtype=np.int64).reshape(-1, 2) - 1

@@ -105,7 +105,7 @@ def find_square_cameras(
     square = {k: with_one_focal(camera) for k, camera in read_cameras(reconstruction, camera_ids).items()}
     trial = try_cameras(reconstruction, square, adjust, solving)
     # the solver gives up what does not fit, so the median would hardly show it
-    shares = error_shares(reconstruction, trial, lambda errors: errors[np.isfinite(errors)].mean())
+    shares = error_shares(reconstruction, trial, np.mean)
     # a camera whose images are gone has none
     return {k: camera for k, camera in square.items() if shares.get(k, 0.0) <= max_error_ratio}
 

@@ -13,7 +13,6 @@ from snakesfm.bundle.alignment import (
 )
 from snakesfm.bundle.image_sources import ImageSource
 from snakesfm.bundle.reading import read_tracks_and_pixels
-from snakesfm.bundle.sharpness import find_blurred
 from snakesfm.geometry.colmap_binding import pycolmap
 from snakesfm.grouping import rows_of_each
 
@@ -32,11 +31,10 @@ def most_share_a_camera(camera_ids: Array) -> bool:
     return bool(np.mean(counts[cameras] > 1) > 0.5)
 
 
-def refine_by_sources(reconstruction: pycolmap.Reconstruction, sources: Sequence[ImageSource]) -> None:
-    """Refine keypoints in the images of each source in turn; those of the first tell which are blurred."""
-    if not sources:
-        return
-    blurred = find_blurred(reconstruction, sources[0])
+def refine_by_sources(
+    reconstruction: pycolmap.Reconstruction, sources: Sequence[ImageSource], blurred: Sequence[int]
+) -> None:
+    """Refine keypoints in the images of each source in turn; ``blurred`` as in :func:`refine_keypoints`."""
     for source in sources:
         source.report(
             *refine_keypoints(reconstruction, source.read_gray, source.scales, source.settings, blurred)

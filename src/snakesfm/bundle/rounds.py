@@ -29,6 +29,7 @@ from snakesfm.bundle.principal_points import find_told_cameras, shared_cameras
 from snakesfm.bundle.registration import left_out_images, register_left_out
 from snakesfm.bundle.round_settings import RoundRecord, RoundSettings
 from snakesfm.bundle.selection import adjust_selection
+from snakesfm.bundle.sharpness import find_blurred
 from snakesfm.bundle.trials import read_cameras, set_cameras
 from snakesfm.bundle.wild_cameras import WildCause, longest_focals_px, reset_wild_cameras
 from snakesfm.geometry.camera import Camera
@@ -65,7 +66,7 @@ def adjust_rounds(
     Parameters
     ----------
     reconstruction : changed in place.
-    read_graph : gives the inlier matches for completion and registration; final rounds do not hold them.
+    read_graph : gives the inlier matches for completion and registration; the last pass does not hold them.
     cameras : the intrinsics at the start.
     solving : how each pass is solved.
     settings : what is done in and between the rounds.
@@ -120,6 +121,7 @@ class _Mapper:
         self.report = report
         self.records: list[RoundRecord] = []
         self.registered_late: set[int] = set()
+        self.blurred: list[int] | None = None
         self.far: Mapping[int, float] = {}
         self.mixed: Mapping[int, float] = {}
         self.adjust = bundle_adjuster(settings.solver)
@@ -195,7 +197,9 @@ class _Mapper:
         """What comes before a round: tracks are completed, and keypoints refined by each of ``sources``."""
         if completing:
             self.complete()
-        refine_by_sources(self.reconstruction, sources)
+        if sources and self.blurred is None:
+            self.blurred = find_blurred(self.reconstruction, sources[0])
+        refine_by_sources(self.reconstruction, sources, self.blurred or ())
 
     def widen_lenses(self) -> bool:
         """After a round, give cameras whose lens is not of their model a wider one; whether some were."""

@@ -49,12 +49,14 @@ def error_shares(
     Parameters
     ----------
     before, after : models of the same points and observations; the cameras are those of the first.
-    average : what is taken instead of the median; errors are infinite where the camera sees no such point.
+    average : what is taken instead of the median, of observations whose points the camera sees before;
+        errors after are infinite where it no longer does.
     """
     (camera_of, errors), (_, left) = _errors(before), _errors(after)
+    seen = {camera_id: mine[np.isfinite(errors[mine])] for camera_id, mine in rows_of_each(camera_of)}
     return {
-        camera_id: float(average(left[mine]) / max(average(errors[mine]), 1e-9))
-        for camera_id, mine in rows_of_each(camera_of)
+        camera_id: float(average(left[mine]) / max(average(errors[mine]), 1e-9)) if len(mine) else np.inf
+        for camera_id, mine in seen.items()
     }
 
 

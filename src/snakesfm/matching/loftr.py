@@ -17,8 +17,8 @@ from snakesfm.learned.device import load_torch
 from snakesfm.learned.pictures import to_array, to_tensor
 from snakesfm.matching.detector_free import STRIP_IMAGES, Picture, no_coordinates
 
-# those of a strip and of the second images before and now; each takes 76 MB at 840 x 632 pixels
-HELD_FEATURES = STRIP_IMAGES + 2
+# those of a strip, and of the second images before and now; each takes 76 MB at 840 x 632 pixels
+HELD_FEATURES = (STRIP_IMAGES, 2)
 
 
 @dataclass(frozen=True)
@@ -86,8 +86,8 @@ class LoftrMatcher:
         network = LoFTR(None, {**default_cfg, "match_coarse": coarse})
         self._network = fill_network(network, state, "LoFTR", ("pos_encoding.pe",))
         self._longer_side_px = longer_side_px
-        # the larger part of a pair's time
-        self._see = functools.lru_cache(HELD_FEATURES)(self._extract)
+        # the larger part of a pair's time; second images must not displace the first ones of a strip
+        self._see = [functools.lru_cache(count)(self._extract) for count in HELD_FEATURES]
 
     def prepare(self, first: Picture) -> PreparedPicture:
         """See :class:`snakesfm.matching.detector_free.DetectorFreeMatcher`."""
@@ -128,7 +128,7 @@ class LoftrMatcher:
         with torch.inference_mode():
             sides = {}
             for side, pictures in enumerate(zip(*pairs, strict=True)):
-                seen = [self._see(picture) for picture in pictures]
+                seen = [self._see[side](picture) for picture in pictures]
                 sides[f"features{side}"] = {
                     name: torch.cat([features[name] for features in seen]) for name in seen[0]
                 }

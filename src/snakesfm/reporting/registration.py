@@ -82,7 +82,8 @@ def reason_not_registered(
         return f"None of its {counts.pairs[image]} pairs was accepted: {_listed(rejections)}."
     if counts.kept[image] == 0:
         return f"All its {counts.accepted[image]} view-graph edges were refused: {_listed(edge_labels)}."
-    if counts.components[image] != 0:
+    # averaging may have joined the filter's components
+    if counts.components[image] != 0 and not counts.positioned[image]:
         size = int(np.sum(counts.components == counts.components[image]))
         return f"It is in a component of {size} images that is not connected to the largest one."
     if not counts.rotated[image]:

@@ -11,7 +11,7 @@ from snakesfm.errors import SceneError
 from snakesfm.geometry.camera import cameras_from_columns
 from snakesfm.geometry.detector_pixels import detector_scales, reduce_cameras
 from snakesfm.geometry.poses import has_pose, translation_of
-from snakesfm.grouping import offsets_of
+from snakesfm.grouping import offsets_of, starts_of
 from snakesfm.stages.job import StageJob
 from snakesfm.triangulation.interface import TriangulationLimits
 from snakesfm.triangulation.tracks import mean_colors, triangulate_tracks
@@ -91,10 +91,10 @@ def split_by_frame(tracks: TrackTable, components: np.ndarray) -> TrackTable:
     # images without a centre tell nothing, so they need no track of their own
     frames = np.maximum(components, 0)[tracks.image_ids]
     order = np.lexsort((frames, track_of))
-    changes = (np.diff(track_of[order]) != 0) | (np.diff(frames[order]) != 0)
+    starts = np.flatnonzero(starts_of(track_of[order], frames[order]))
     return replace(
         tracks,
-        offsets=np.r_[0, np.flatnonzero(changes) + 1, len(order)] if len(order) else tracks.offsets,
+        offsets=np.append(starts, len(order)),
         image_ids=tracks.image_ids[order],
         keypoint_ids=tracks.keypoint_ids[order],
         part_ids=tracks.part_ids[order],

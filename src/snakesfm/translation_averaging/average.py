@@ -144,7 +144,9 @@ def _further_parts(
         share = _share(part.ray_residuals_rad[part.placed[part.ray_images]], settings.limits)
         if np.count_nonzero(part.placed) >= min_images and share >= DOUBTFUL_SHARE:
             parts.append((part, share))
-        left[part.placed if part.placed.any() else images] = False
+            left[part.placed] = False
+        else:
+            left[images] = False
 
 
 def average_translations(problem: PositioningProblem, settings: PositioningSettings) -> AveragedCenters:
@@ -178,6 +180,8 @@ def average_translations(problem: PositioningProblem, settings: PositioningSetti
             more, whole = with_rays(part, many).number_tracks()[0], part.number_tracks()[0]
             best = max(agreeing_share(whole, centers, limits), LEAST_SHARE)
             for start in range(settings.restarts):
+                if best >= DOUBTFUL_SHARE:
+                    break
                 other = settings.restart.position(more, settings.seed + start)
                 # cameras that were left out may have scales of their own
                 other = np.where(np.isfinite(first), other, np.nan)
@@ -185,8 +189,6 @@ def average_translations(problem: PositioningProblem, settings: PositioningSetti
                 share = agreeing_share(whole, other, limits)
                 if share > best:
                     chosen, centers, best = more, other, share
-                if best >= DOUBTFUL_SHARE:
-                    break
     centers = normalize_gauge(part, centers)
     return AveragedCenters(
         centers=centers,

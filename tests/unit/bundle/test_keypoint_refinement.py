@@ -288,8 +288,9 @@ def test_sharp_images_align_as_well_beside_a_blurred_one(scene):
     images = list(scene[1])
     images[2] = in_motion(images[2])
     sharp, beside, to_blurred = (model_of(scene, 0.35) for _ in range(3))
-    refine_by_sources(sharp, [source_of(scene[1])])
-    refine_by_sources(beside, [source_of(images)])
+    assert find_blurred(beside, source_of(images)) == [2]
+    refine_by_sources(sharp, [source_of(scene[1])], ())
+    refine_by_sources(beside, [source_of(images)], [2])
     refine_keypoints(to_blurred, read(images), np.ones(5), SETTINGS)
     found = [np.median(spread_px(model, scene[3], without=2)) for model in (sharp, beside, to_blurred)]
     assert 0.001 < found[1] < 1.2 * found[0] < 0.5 * found[2]
