@@ -22,6 +22,17 @@ def show_pixels(pixels: Array, orientation: int) -> Array:
     return np.ascontiguousarray(pixels)
 
 
+def store_pixels(pixels: Array, orientation: int) -> Array:
+    """An image (H,W,...) as stored, of one that an EXIF orientation 1..8 shows."""
+    if orientation in MIRRORED_Y:
+        pixels = pixels[::-1]
+    if orientation in MIRRORED_X:
+        pixels = pixels[:, ::-1]
+    if orientation in SWAPPED:
+        pixels = pixels.swapaxes(0, 1)
+    return np.ascontiguousarray(pixels)
+
+
 def shown_size(size: tuple[int, int], orientation: int) -> tuple[int, int]:
     """Width and height of an image as shown."""
     return size[::-1] if orientation in SWAPPED else size

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from snakesfm.arrays import Array
+from snakesfm.geometry.orientations import MIRRORED_Y, SWAPPED
 
 if TYPE_CHECKING:
     import pycolmap
@@ -67,7 +68,7 @@ def lower_sides(rotations: Array, orientations: Array) -> Array:
     rotations : (N,3,3) cam_from_world, NaN where not registered.
     orientations : (N,) EXIF orientations 1..8, which tell the lower side of the pixels as stored.
     """
-    axes = np.where(orientations >= 5, 0, 1)
-    signs = np.where(np.isin(orientations, (3, 4, 7, 8)), -1.0, 1.0)
+    axes = np.where(np.isin(orientations, SWAPPED), 0, 1)
+    signs = np.where(np.isin(orientations, MIRRORED_Y), -1.0, 1.0)
     lower: Array = signs[:, None] * rotations[np.arange(len(rotations)), axes]
     return lower

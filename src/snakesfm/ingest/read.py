@@ -9,10 +9,9 @@ import errno
 import hashlib
 import mmap
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
-from functools import partial
 from io import BytesIO
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -33,6 +32,7 @@ from PIL import (
 
 from snakesfm.arrays import Array
 from snakesfm.errors import ImageError, SceneError, UnreadableImageError
+from snakesfm.geometry.orientations import store_pixels
 from snakesfm.ingest.exif import Exif, read_exif
 
 # a JPEG that holds several pictures is opened as JPEG and then calls itself MPO
@@ -40,16 +40,6 @@ FORMATS = ("JPEG", "PNG", "TIFF", "WEBP", "BMP")
 MINIMUM_SIDE_PX = 32
 # far beyond any camera, and still read in a few GB
 MAXIMUM_PIXELS = 1 << 30
-# PIL applies the orientation of TIFF files, and only of these
-UNDO_TURN: dict[int, Callable[[Array], Array]] = {
-    2: np.fliplr,
-    3: partial(np.rot90, k=2),
-    4: np.flipud,
-    5: partial(np.swapaxes, axis1=0, axis2=1),
-    6: np.rot90,
-    7: lambda pixels: np.rot90(pixels, 2).swapaxes(0, 1),
-    8: partial(np.rot90, k=3),
-}
 # as PIL's decoders say it, in an OSError
 PIL_OUT_OF_MEMORY = "out of memory"
 # what stands for no value in pictures of floating-point numbers
@@ -327,14 +317,15 @@ def _layout_of_deep_colours(image: Image.Image) -> str:
 
 def _decode_stored(data: bytes, image: Image.Image) -> Array:
     """Gray (H,W) or colours (H,W,3) of an opened image in the file's depth, alpha composed over black."""
-    turn_back = UNDO_TURN.get(_tiff_orientation(image))
+    # PIL applies the orientation of TIFF files, and only of these
+    orientation = _tiff_orientation(image)
     # loading drops what tells the depth, but no damage passes it
     layout = _layout_of_deep_colours(image)
     # colours of RGBa are multiplied by alpha already
     transparent = image.has_transparency_data and "RGBa" not in layout
     image.load()
     values = _decode_deep(data, transparent) if layout else _decoded_values(image)
-    return values if turn_back is None else np.ascontiguousarray(turn_back(values))
+    return store_pixels(values, orientation)
 
 
 def _decode_deep(data: bytes, transparent: bool) -> Array:
